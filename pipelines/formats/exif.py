@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal
 
 from PIL import ExifTags
@@ -37,6 +38,8 @@ _HIGHEST_M = 20_000.0  # no photograph of a survey is taken higher
 _FOOT_M = 0.3048
 _NO_35_MM = frozenset({1.0, 65535.0})  # how cameras write that they do not know
 _TEXT_NUMBER = re.compile(r"[+-]?\d+(?:\.\d+)?")
+# Degrees with a decimal comma: no minutes have three digits. Degrees and minutes (`46,1.2N`) have a decimal point.
+_DECIMAL_COMMA = re.compile(r"\s*([+-]?\d+),(\d{3,})\s*°?\s*([NSEW]?)\s*", re.IGNORECASE)
 # Names of latitude and longitude: DJI's (an early one misspelt) and Adobe's, Skydio's and Autel's.
 _XMP_AXES = (("GpsLatitude", ("GpsLongitude", "GpsLongtitude")), ("Latitude", ("Longitude",)))
 _VOID = frozenset({"invalid", "v", "void", "none"})
@@ -116,6 +119,12 @@ class PhotoTags:
         """All positions that the tags state, EXIF's first."""
         return self.more_gps if self.gps is None else (self.gps, *self.more_gps)
 
+    @property
+    def says_sea_level(self) -> bool:
+        """Whether GPSAltitudeRef says in the words of EXIF 3.0 that the altitude counts from sea level."""
+        tag = self.exif.get("GPS GPSAltitudeRef")
+        return tag is not None and not tag.is_text and tag.data[:1] in (b"\x02", b"\x03")
+
 
 def read_tags(data: bytes) -> PhotoTags:
     """Return EXIF and XMP of a photograph; tags that cannot be read become `problems`, never an error."""
@@ -181,7 +190,7 @@ def _gps(tags: Mapping[str, Tag], notes: _Notes) -> GpsTag | None:
     lat, lon = (_signed(tags, f"GPS GPS{axis}", notes) for axis in ("Latitude", "Longitude"))
     if lat is None or lon is None:
         if "GPS GPSLatitude" in tags or "GPS GPSLongitude" in tags:
-            notes.problems.append("the GPS latitude or longitude is not a number")
+            notes.problems.append("the GPS latitude or longitude is no angle in degrees, minutes and seconds")
         return None
     if not (math.isfinite(lat) and math.isfinite(lon)):
         notes.problems.append("the GPS position does not say its hemisphere")
@@ -249,7 +258,10 @@ def _signed(tags: Mapping[str, Tag], key: str, notes: _Notes) -> float | None:
 
 
 def _degrees(fractions: Sequence[tuple[float, float]]) -> float | None:
-    """Return degrees from degrees, minutes and seconds; some writers omit seconds, or minutes too, or write 0/0."""
+    """Return degrees from degrees, minutes and seconds; some writers omit seconds, or minutes too, or write 0/0.
+
+    None: no numbers, minutes or seconds above 60, or 0/0 behind whole degrees or minutes, whose rest is unknown.
+    """
     parts = list(fractions)
     while len(parts) > 1 and parts[-1] == (0, 0):
         parts.pop()
@@ -258,12 +270,18 @@ def _degrees(fractions: Sequence[tuple[float, float]]) -> float | None:
     values = [above / below for above, below in parts]
     if not all(math.isfinite(value) for value in values):
         return None
+    if len(parts) < len(fractions) and values[-1].is_integer():
+        return None
+    if any(abs(below) > 60.0 and above != 0.0 for above, below in pairwise(values)):
+        return None
     total = sum(abs(value) / 60.0**power for power, value in enumerate(values))
     return -total if min(values) < 0.0 else total
 
 
 def _degrees_of_text(text: str) -> tuple[float | None, str]:
     """Return degrees of a text such as `33,24.7407S`, `33 24 44.4` or `-33.41`, and its letter of a hemisphere."""
+    if (decimal := _DECIMAL_COMMA.fullmatch(text)) is not None:
+        text = f"{decimal[1]}.{decimal[2]}{decimal[3]}"
     numbers = [float(number) for number in _TEXT_NUMBER.findall(text)]
     if not 1 <= len(numbers) <= 3:
         return None, ""
@@ -326,10 +344,10 @@ def _altitude_reference(tags: Mapping[str, Tag], notes: _Notes) -> int:
 
 def _length_m(text: str) -> float | None:
     """Return metres of a text such as `396 m`, `396` or `1299 ft`."""
-    found = re.fullmatch(r"\s*([+-]?\d+(?:\.\d*)?)\s*(m|metres|meters|ft|feet)?\.?\s*", text, re.IGNORECASE)
+    found = re.fullmatch(r"\s*([+-]?\d+(?:[.,]\d*)?)\s*(m|metres|meters|ft|feet)?\.?\s*", text, re.IGNORECASE)
     if found is None:
         return None
-    return float(found[1]) * (_FOOT_M if (found[2] or "").casefold().startswith("f") else 1.0)
+    return float(found[1].replace(",", ".")) * (_FOOT_M if (found[2] or "").casefold().startswith("f") else 1.0)
 
 
 def _direction(tags: Mapping[str, Tag]) -> float | None:

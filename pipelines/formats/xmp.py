@@ -18,7 +18,7 @@ _ROOT = re.compile(rb"<(x:xmpmeta|x:xapmeta|[\w.-]*:?RDF)\b")
 _MAX_PACKET_BYTES = 4 * 1024 * 1024
 _MAX_PROPERTIES = 10_000
 _MAX_TEXT = 4096
-_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?:/\s*(\d+))?\s*(?:m|°|deg)?\s*$")
+_NUMBER = re.compile(r"\s*([+-]?(?:\d+[.,]?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?:/\s*(\d+))?\s*(?:m|°|deg)?\s*$")
 
 
 class XmpError(ValueError):
@@ -86,11 +86,14 @@ class Xmp:
 
 
 def number_of(text: str) -> float | None:
-    """Return a finite number or fraction that a text states, with or without metres or degrees behind it."""
+    """Return a finite number or fraction that a text states, with or without metres or degrees behind it.
+
+    Some programs write a comma for the decimal point, in the language of their user.
+    """
     found = _NUMBER.match(text)
     if found is None or (found[2] is not None and float(found[2]) == 0.0):
         return None
-    value = float(found[1]) / float(found[2] or 1.0)
+    value = float(found[1].replace(",", ".")) / float(found[2] or 1.0)
     return value if math.isfinite(value) else None
 
 

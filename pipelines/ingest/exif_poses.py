@@ -40,6 +40,7 @@ from pipelines.robust.statistics import blunders_among, mad_sigma, median_spacin
 # Vertical over horizontal σ of a fix that states only the horizontal one.
 _VERTICAL_RATIO = 2.0
 _RECEIVER = {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}
+_SEA_LEVEL_NOTE = "but GPSAltitudeRef says that they count from sea level: --vertical names the geoid"
 _EXIF_NOTE = "EXIF's altitude is often above a geoid or barometric, and --vertical states its datum"
 _SIGMAS, _LEAST_M = 4.0, 1.0
 _MOST_INCONSISTENT = 1 / 3
@@ -73,11 +74,6 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, remarks: Re
     remarks.warn_counted(
         "image-without-altitude", flat, "Images have a GPS position without altitude, which is not used"
     )
-    datums = sorted({photo.tags.gps.datum for photo in photos if photo.tags.gps is not None} - {""})
-    if datums:
-        remarks.assume(
-            "exif-datum", f"The datum {', '.join(datums)} of EXIF's positions (GPSMapDatum) is taken as WGS84."
-        )
     crs = parse_crs(WGS84, vertical=options.vertical)
     position_in_ecef = np.full((len(photos), 3), np.nan)
     position_in_ecef[located] = ecef_from_lla(crs.lla_from_xyz(xyz[located]))
@@ -88,7 +84,8 @@ def poses_from_tags(photos: Sequence[Photo], options: IngestOptions, remarks: Re
     free = [options.sigma_h is None, options.sigma_h is None, options.sigma_v is None]
     sigma = np.where(free, np.hypot(sigma, tagged.sigma_m), sigma)
     attitudes = tagged_attitudes(photos, xyz[:, :2], time_s, remarks)
-    assumed = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=_EXIF_NOTE)
+    note = _SEA_LEVEL_NOTE if any(photo.tags.says_sea_level for photo in photos) else _EXIF_NOTE
+    assumed = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=note)
     return ImagePoses(
         position_in_ecef=position_in_ecef,
         sigma_enu_m=sigma,

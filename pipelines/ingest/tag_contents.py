@@ -56,11 +56,14 @@ def note_repeats(names: Sequence[str], lat_lon_deg: FloatArray, time_s: FloatArr
 
 
 def contents(photos: Sequence[Photo]) -> str:
-    """Return a sentence on what the tags of photographs hold beside positions; empty if nothing."""
+    """Return a sentence on what the tags of photographs hold beside whole positions; empty if nothing."""
     found = []
     models = sorted({photo.tags.make_model.strip() for photo in photos} - {""})
     if models:
         found.append(f"the camera ({', '.join(models[:3])})")
+    flat = sum(photo.tags.gps is not None and photo.tags.gps.alt_m is None for photo in photos)
+    if flat:
+        found.append(f"latitudes and longitudes without a height of {flat}")
     times = [photo.tags.timestamp_s for photo in photos if photo.tags.timestamp_s is not None]
     if times:
         first, last = (

@@ -12,15 +12,21 @@ values are stated; where no rule decides, the first source counts with a σ that
 6. Where a few photographs differ, their neighbours decide; where all scatter, the steadier track does.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.formats.exif import GpsTag
+from pipelines.geodesy.crs import PointCrs, parse_crs
+from pipelines.geodesy.crs_names import code_of_name
 from pipelines.geodesy.vertical import FOOT_M
 from pipelines.ingest.photo_folder import Photo
+from pipelines.ingest.reference_system import note_operation
 from pipelines.ingest.remarks import Remarks, shortened
 from pipelines.ingest.written_values import (
     M_PER_DEG,
@@ -36,6 +42,7 @@ _FINE_M = 0.1  # a step that no σ of a plain receiver notices
 _SLACK_M = 0.02
 _FEW = 1 / 3  # of the photographs, whose differences are blunders
 _DECISIVE = 0.5
+_DATUM_SIGMA_M = 500.0  # national datums, and the shifted maps of one country, are up to some 700 m from WGS84
 _LOWEST_GROUND_M = -450.0  # the shore of the Dead Sea
 
 
@@ -69,7 +76,7 @@ class _Choice:
 
 def tagged_positions(photos: Sequence[Photo], remarks: Remarks) -> TaggedPositions:
     """Return the positions that the tags of photographs state; what was chosen and left out is noted."""
-    used = _without_void(photos, remarks)
+    used, datum_m = _in_wgs84(_without_void(photos, remarks), remarks)
     names = [photo.name for photo in photos]
     flight = _Flight(names, _in_time(photos), _column(photos, "relative_altitude_m"), remarks)
     horizontal, heights = _sources(used), _height_sources(photos, used)
@@ -96,7 +103,7 @@ def tagged_positions(photos: Sequence[Photo], remarks: Remarks) -> TaggedPositio
     return TaggedPositions(
         xyz=np.column_stack([place.values[:, ::-1], height.values[:, 0]]),
         sigma_m=np.column_stack([place_h, place_h, np.hypot(height.sigma_m, digits_v)]),
-        common_sigma_m=(place.common_m, UNKNOWN_SIGMA_M if unknown else height.common_m),
+        common_sigma_m=(math.hypot(place.common_m, datum_m), UNKNOWN_SIGMA_M if unknown else height.common_m),
     )
 
 
@@ -122,6 +129,44 @@ def _without_void(photos: Sequence[Photo], remarks: Remarks) -> list[tuple[GpsTa
         "Positions are left out of which the receiver says that it had no fix (GPSStatus is void)",
     )
     return [tuple(tag for tag in tags if not tag.void) for tags in tagged]
+
+
+def _in_wgs84(tagged: Sequence[tuple[GpsTag, ...]], remarks: Remarks) -> tuple[list[tuple[GpsTag, ...]], float]:
+    """Return positions whose tags name another datum in WGS84, and the σ in m of a datum that nobody knows."""
+    unknown_m = 0.0
+    moved: dict[GpsTag, GpsTag] = {}
+    for name in sorted({tag.datum for tags in tagged for tag in tags} - {""}):
+        old = list(dict.fromkeys(tag for tags in tagged for tag in tags if tag.datum == name))
+        crs = _crs_of_datum(name)
+        try:
+            lla = None if crs is None else crs.lla_from_xyz([(tag.lon_deg, tag.lat_deg, 0.0) for tag in old])
+        except InputError:  # They lie outside the area of that datum.
+            lla = None
+        if crs is None or lla is None:
+            unknown_m = _DATUM_SIGMA_M
+            remarks.caution(
+                "exif-datum-unknown",
+                f"The tags say that the positions of {len(old)} photographs are in {name[:40]!r} (GPSMapDatum): no "
+                f"datum that PROJ knows there. They are taken as WGS84, and {unknown_m:.0f} m are added to the "
+                "σ of the error that they share.",
+            )
+            continue
+        remarks.assume(
+            "exif-datum",
+            f"The positions of {len(old)} photographs are in {name} (GPSMapDatum), read as {crs.name}, and are "
+            "transformed to WGS84.",
+        )
+        note_operation(crs, lla, Path("EXIF"), "positions", remarks)
+        pairs = zip(old, lla.tolist(), strict=True)
+        moved |= {tag: replace(tag, lat_deg=lat, lon_deg=lon) for tag, (lat, lon, _) in pairs}
+    return [tuple(moved.get(tag, tag) for tag in tags) for tags in tagged], unknown_m
+
+
+def _crs_of_datum(name: str) -> PointCrs | None:
+    """Return the latitudes and longitudes of a datum by its name; None: PROJ has none of that name."""
+    code = code_of_name(name)
+    crs = None if code is None else parse_crs(f"EPSG:{code}")
+    return crs if crs is not None and crs.is_geographic else None
 
 
 def _sources(tagged: Sequence[tuple[GpsTag, ...]]) -> dict[str, FloatArray]:

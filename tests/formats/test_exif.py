@@ -35,7 +35,11 @@ def test_without_altitude_dji_may_know_it() -> None:
 @pytest.mark.parametrize(
     ("entries", "problem"),
     [
-        ([(1, ASCII, "N"), (2, RATIONAL, [(46, 1), (0, 1), (5, 0)]), *gps_entries(46.0, 7.0)[2:]], "not a number"),
+        ([(1, ASCII, "N"), (2, RATIONAL, [(46, 1), (0, 1), (5, 0)]), *gps_entries(46.0, 7.0)[2:]], "no angle"),
+        # Whole minutes whose seconds are 0/0: up to 1.8 km are unknown.
+        ([(1, ASCII, "N"), (2, RATIONAL, [(46, 1), (1, 1), (0, 0)]), *gps_entries(46.0, 7.0)[2:]], "no angle"),
+        ([(1, ASCII, "N"), (2, RATIONAL, [(46, 1), (75, 1), (0, 1)]), *gps_entries(46.0, 7.0)[2:]], "no angle"),
+        ([(1, ASCII, "N"), (2, RATIONAL, [(46, 1), (1, 1), (90, 1)]), *gps_entries(46.0, 7.0)[2:]], "no angle"),
         ([*gps_entries(46.0, 7.0)[1:]], "does not say its hemisphere"),
         ([(1, ASCII, "N"), (2, RATIONAL, [(97, 1), (0, 1), (0, 1)]), *gps_entries(46.0, 7.0)[2:]], "out of range"),
         (gps_entries(0.0, 0.0), "means none"),
@@ -45,6 +49,39 @@ def test_positions_that_cannot_be_trusted(entries: list[Entry], problem: str) ->
     tags = read_tags(jpeg(exif=_gps(entries)))
     assert tags.gps is None
     assert problem in tags.problems[0]
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [(46, 1), (12, 10), (0, 0)],  # minutes with a fraction need no seconds
+        [(4602, 100), (0, 0), (0, 0)],
+        [(46, 1), (1, 1), (12, 1)],
+        [(0, 1), (0, 1), (165672, 1)],  # seconds alone
+        [(46, 1), (120, 100)],
+    ],
+)
+def test_degrees_in_every_division(parts: list[tuple[int, int]]) -> None:
+    gps = read_tags(jpeg(exif=_gps([(1, ASCII, "N"), (2, RATIONAL, parts), *gps_entries(46.0, 7.0)[2:]]))).gps
+    assert gps is not None and gps.lat_deg == pytest.approx(46.02, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("lat", "lon", "height"),
+    [("46,0200000", "7,7500000", "+620,50"), ("46,02000", "-7,75000", "620,5"), ("46.02", "7.75", "620.5 m")],
+)
+def test_decimal_commas_of_xmp(lat: str, lon: str, height: str) -> None:
+    tags = read_tags(jpeg(xmp=dji_xmp(GpsLatitude=lat, GpsLongitude=lon, AbsoluteAltitude=height)))
+    (gps,) = tags.positions
+    assert (gps.lat_deg, abs(gps.lon_deg), gps.alt_m) == pytest.approx((46.02, 7.75, 620.5), abs=1e-9)
+    assert (gps.lon_deg < 0.0) == lon.startswith("-")
+
+
+def test_a_decimal_comma_of_a_text_in_exif() -> None:
+    entries: list[Entry] = [(1, ASCII, "S"), (2, ASCII, "46,02000"), (3, ASCII, "W"), (4, ASCII, "7,75000 W")]
+    gps = read_tags(jpeg(exif=_gps([*entries, (6, ASCII, "620,5 m")]))).gps
+    assert gps is not None
+    assert (gps.lat_deg, gps.lon_deg, gps.alt_m) == pytest.approx((-46.02, -7.75, 620.5), abs=1e-9)
 
 
 def test_horizontal_error_and_datum() -> None:

@@ -7,10 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.exif import DjiTags, GpsTag, PhotoTags
+from pipelines.formats.exif import DjiTags, GpsTag, PhotoTags, read_tags
 from pipelines.formats.image_file import ImageFile
 from pipelines.formats.trajectory_csv import PoseTable
 from pipelines.geodesy import enu
@@ -21,6 +22,7 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.table_poses import poses_from_table
+from tests.photos import BYTE, Exif, gps_entries, jpeg
 from tests.refusals import codes, numbers, refused, said
 
 GPS = GpsTag(46.02, 7.75, 1620.0, None, "")
@@ -109,12 +111,55 @@ def test_a_gimbal_is_kept_with_or_without_position() -> None:
     assert np.isnan(poses.enu_from_cam[1]).all()
 
 
-def test_images_without_altitude_and_with_other_datums_are_noted() -> None:
+def test_images_without_altitude_are_noted() -> None:
     remarks = Remarks()
-    photos = _photos(PhotoTags(gps=replace(GPS, alt_m=None)), PhotoTags(gps=replace(GPS, datum="TOKYO")))
+    photos = _photos(PhotoTags(gps=replace(GPS, alt_m=None)), PhotoTags(gps=GPS))
     assert poses_from_tags(photos, IngestOptions(), remarks).located.tolist() == [False, True]
     assert "(1): 0.jpg." in said(remarks.warnings, "image-without-altitude")
-    assert "TOKYO" in said(remarks.assumptions, "exif-datum")
+
+
+@pytest.mark.parametrize(("reference", "stated"), [(0, False), (2, True)])
+def test_a_reference_to_sea_level_is_told(reference: int, stated: bool) -> None:
+    entries = [entry for entry in gps_entries(46.02, 7.75, 620.0) if entry[0] != 5]
+    tags = read_tags(jpeg(exif=Exif(gps=[*entries, (5, BYTE, reference)])))
+    poses = poses_from_tags(_photos(tags), IngestOptions(), Remarks())
+    assert not poses.vertical.stated and ("sea level" in poses.vertical.note) == stated
+    assert _lla(poses)[0, 2] == pytest.approx(620.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("datum", "code", "lat", "lon", "least_m"),
+    [
+        ("TOKYO", 4301, 35.68, 139.77, 400.0),
+        ("NAD-27", 4267, 34.05, -118.25, 80.0),
+        ("ED50", 4230, 46.0, 7.7, 100.0),
+    ],
+)
+def test_positions_of_another_datum_are_transformed(
+    datum: str, code: int, lat: float, lon: float, least_m: float
+) -> None:
+    remarks = Remarks()
+    tag = replace(GPS, lat_deg=lat, lon_deg=lon, datum=datum)
+    poses = poses_from_tags(_photos(PhotoTags(gps=tag)), IngestOptions(), remarks)
+    to_wgs84 = pyproj.Transformer.from_crs(code, 4326, always_xy=True)
+    expected_lon, expected_lat = to_wgs84.transform(lon, lat)
+    moved_m = 111_320.0 * np.hypot(expected_lat - lat, (expected_lon - lon) * np.cos(np.radians(lat)))
+    assert moved_m > least_m, "the test is worth something only where the datums are apart"
+    # The same operation but for grids that depend on the place: 5 m is their published accuracy.
+    apart_m = 111_320.0 * np.abs(_lla(poses)[0, :2] - [expected_lat, expected_lon]).max()
+    assert apart_m < 5.0
+    assert datum in said(remarks.assumptions, "exif-datum")
+    assert remarks.transformations[0].crs == f"EPSG:{code}"
+
+
+@pytest.mark.parametrize("datum", ["GCJ-02", "TOKYO"])
+def test_an_unknown_datum_and_one_of_elsewhere_are_cautions_with_its_sigma(datum: str) -> None:
+    remarks = Remarks()
+    tag = replace(GPS, lat_deg=46.0, lon_deg=7.7, datum=datum)
+    poses = poses_from_tags(_photos(PhotoTags(gps=tag)), IngestOptions(), remarks)
+    np.testing.assert_allclose(_lla(poses)[0, :2], [46.0, 7.7], atol=1e-9)
+    assert [caution.code for caution in remarks.cautions] == ["exif-datum-unknown"]
+    assert poses.common_sigma_m[0] >= 500.0
 
 
 def test_height_is_of_exif_or_else_of_xmp() -> None:
