@@ -69,8 +69,9 @@ def align(colmap: Any, job: SfmJob, progress: Progress) -> Alignment:
             best = max(best, again, key=_merit)
     if len(best.models) > 1 and best.registered < len(job.survey.images):
         _tell_of_parts(best, len(job.survey.images))
+        alone = best.registered  # Joining adds photographs to this very model.
         largest, parts = join_parts(colmap, best.models, job.survey)
-        _tell_of_joins(parts, best.registered)
+        _tell_of_joins(parts, alone)
         best = replace(best, models=[largest])
     return best
 

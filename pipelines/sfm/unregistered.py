@@ -34,8 +34,10 @@ def unregistered(colmap: Any, database: Path, model: Any, remedy: str = "") -> t
                 matches[one][other] = int(found)
                 if other in inside:
                     rows = np.asarray(opened.read_two_view_geometry(one, other).inlier_matches)[:, 1]
+                    # A model of an earlier round lacks the features that were added to the database after it.
                     points = inside[other].points2D
-                    shared[one][other] = sum(points[int(row)].has_point3D() for row in rows)
+                    known = rows[rows < len(points)]
+                    shared[one][other] = sum(points[int(row)].has_point3D() for row in known)
     if not lost:
         return ()
     reasons = [f"{names[one]}: {_reason(matches[one], shared[one], names)}" for one in lost[:_MOST_LISTED]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from pipelines.sfm.lens_check import lenses_astray
 from pipelines.sfm.mapping import map_database
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.parts import join_parts
+from pipelines.sfm.unregistered import unregistered
 from pipelines.survey.survey import Attitude, Fix, Survey
-from tests.refusals import logged_codes
+from tests.refusals import logged_codes, numbers, said
 from tests.sfm_scenes import survey_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -219,6 +221,46 @@ def test_added_features_make_a_model(tmp_path: Path) -> None:
     assert np.abs(umeyama(solved, true).apply(solved) - true).max() < 1e-3
     kept = next(iter(models[0].cameras.values()))
     assert list(kept.params) == pytest.approx(list(job.survey.cameras[0].params))
+
+
+def test_what_is_joined_is_told_with_the_size_of_each_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    truth = true_model()
+    ids = sorted(truth.reg_image_ids())
+    job = matched(tmp_path, true_model(8))
+    job = replace(job, survey=surveyed(truth))
+    models = [part_of(truth, ids[:9], 1), part_of(truth, ids[9:], 2)]
+    monkeypatch.setattr(rounds, "map_database", lambda *_, **__: (models, "incremental"))
+    monkeypatch.setattr(rounds, "missing_for_learned", lambda: "an extra")
+    assert rounds.align(pycolmap, job, SILENT).registered == IMAGES
+    (told,) = [record for record in caplog.records if getattr(record, "code", "") == "survey-in-parts"]
+    assert numbers(told.getMessage()) == [2, 9, IMAGES - 9]
+
+
+def test_a_model_of_fewer_features_than_its_database_has_reasons(tmp_path: Path) -> None:
+    """Where a later round adds features and is no better, the model of the earlier one is kept."""
+    truth = true_model(8)
+    ids = sorted(truth.reg_image_ids())
+    job = matched(tmp_path, truth)
+    models, _ = map_database(pycolmap, job, SILENT, lens_held=True)
+    short = type(models[0])()
+    for camera in models[0].cameras.values():
+        short.add_camera(camera)
+        short.add_rig(next(iter(models[0].rigs.values())))
+    for image_id in ids[:-1]:
+        image = models[0].images[image_id]
+        frame = pycolmap.Frame(frame_id=image.frame_id, rig_id=1)
+        frame.add_data_id(image.data_id)
+        frame.rig_from_world = image.cam_from_world()
+        short.add_frame(frame)
+        few = np.array([point.xy for point in image.points2D])[:5]
+        kept = pycolmap.Image(image.name, keypoints=few, camera_id=image.camera_id, image_id=image_id)
+        kept.frame_id = image.frame_id
+        short.add_image(kept)
+        short.register_frame(image.frame_id)
+    sentence = said(unregistered(pycolmap, job.database, short), "photographs-not-registered")
+    assert truth.images[ids[-1]].name in sentence and "of which 0 are points of the model" in sentence
 
 
 def test_a_lens_that_is_refused_stays_as_stated(
