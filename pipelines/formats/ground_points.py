@@ -184,13 +184,17 @@ def read_point_list(path: Path) -> GroundPoints:
     return GroundPoints(path, POINT_LIST, without_repeats(points, path), crs_text=crs_text)
 
 
+_WKT = re.compile(r"[A-Z]{3,}[A-Z_0-9]*\s*\[")
+
+
 def _odm_table(path: Path, columns: Sequence[str]) -> tables.Table:
     """Return the rows below the CRS but comments, with columns in an order."""
     lines = [(at, text) for at, text in tables.numbered_lines(path) if not text.startswith("#")]
     tables.require_rows(lines, path)
     first, crs_text = lines[0]
     words = crs_text.split()
-    if len(words) >= 3 and tables.is_number(words[1], decimal_comma=False) and not crs_text.startswith("+"):
+    is_row = len(words) >= 3 and tables.is_number(words[1], decimal_comma=False)
+    if is_row and not crs_text.startswith("+") and not _WKT.match(crs_text):
         message = "The first line must be the CRS, e.g. EPSG:4326 or WGS84 UTM 16N; this is a row."
         raise InputError("crs-missing", message, path=path, line=first)
     tables.require_rows(lines[1:], path)

@@ -8,6 +8,7 @@ begin formulas (OWASP, CSV injection), and names of points and photographs come 
 begins with an apostrophe. Numbers stay as they are. `plain_text` gives names back as they were.
 """
 
+import codecs
 import csv
 import io
 import math
@@ -59,7 +60,9 @@ def plain_text(cell: str) -> str:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a UTF-8 text file, without byte order mark and line ends (LF, CRLF or CR).
+    """Return the lines of a text file, without byte order mark and line ends (LF, CRLF or CR).
+
+    The text is UTF-8, or UTF-16 where its byte order mark says so, as spreadsheets save "Unicode text".
 
     Raises:
         InputError: missing, a folder, larger than 128 MiB, of more than a million lines, with a line of more than
@@ -67,7 +70,7 @@ def read_lines(path: Path) -> list[str]:
     """
     lines: list[str] = []
     file_size(path, limit_bytes=MAX_BYTES, kind="text table")
-    with reading(path), path.open(encoding="utf-8-sig", errors="surrogateescape") as handle:
+    with reading(path), path.open(encoding=_encoding(path), errors="surrogateescape") as handle:
         while text := handle.readline(LONGEST_LINE + 1):
             _check_line(text, path, len(lines) + 1)
             lines.append(text.removesuffix("\n"))
@@ -102,7 +105,13 @@ def beginning(path: Path) -> str:
     """
     file_size(path)
     with reading(path), path.open("rb") as handle:
-        return handle.read(_BEGINNING_BYTES).decode("utf-8-sig", "replace")
+        return handle.read(_BEGINNING_BYTES).decode(_encoding(path), "replace")
+
+
+def _encoding(path: Path) -> str:
+    """Return the encoding of a text by its byte order mark."""
+    with path.open("rb") as handle:
+        return "utf-16" if handle.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
 
 
 def number_of(text: str, *, path: Path, line: int, field: str, decimal_comma: bool = False) -> float:

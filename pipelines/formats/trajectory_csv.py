@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, FloatArray, IntArray, rows_of
 from pipelines.formats import column_names, tables
 from pipelines.formats.place_columns import place_columns
+from pipelines.formats.time_columns import TIMES, has_times, times_of
 from pipelines.geometry.rotations import geo_from_cam, map_from_cam, quat_xyzw_from_matrix
 
 
@@ -82,7 +82,7 @@ _VOCABULARY = (
     {"image": "image", **column_names.COORDINATES, **column_names.ANGLES, **column_names.ACCURACIES}
     | column_names.IMAGES
     | {"name": "image", "label": "image"}
-    | dict.fromkeys(("timestamp", "time", "t", "datetime", "timeutc", "utctime", "utc", "unixtime"), "timestamp")
+    | TIMES
 )
 _NEEDED = "image and/or timestamp, then latitude,longitude,altitude or x,y,z"
 _ANGLES = ("yaw", "pitch", "roll")
@@ -101,7 +101,6 @@ _RANGES = {
 }
 _MOST_CONVERGENCE_DEG = 10.0  # in a zone of UTM near the pole
 _FEWEST_WORDS = 4  # between spaces, of a header without other separators
-_LATEST_S = 1e11  # the year 5138; larger numbers are milliseconds or finer
 
 
 def read_trajectory(path: Path, *, projected: bool = False) -> PoseTable:
@@ -119,7 +118,7 @@ def read_trajectory(path: Path, *, projected: bool = False) -> PoseTable:
     xyz = place.numbers(table.rows)
     if place.geographic:
         _require_ranges(xyz[:, :2], place.plan, table)
-    time_s, zoneless = _times(table) if "timestamp" in table.columns else (None, False)
+    time_s, zoneless = times_of(table) if has_times(table.columns) else (None, False)
     attitudes, of_grid = _attitudes(table)
     return PoseTable(
         path=path,
@@ -158,7 +157,7 @@ def _read_table(path: Path) -> tuple[tables.Table, list[str]]:
     columns, unknown = tables.named_columns(names, _VOCABULARY, path, first + 1)
     if not columns:
         raise tables.unknown_header(names, _VOCABULARY, _NEEDED, path=path, line=first + 1)
-    if "image" not in columns and "timestamp" not in columns:
+    if "image" not in columns and not has_times(columns):
         message = f"The header has no column image and no column timestamp; it has {column_names.listed(names)}."
         message += column_names.proposals(unknown, _VOCABULARY)
         raise InputError("column-missing", message, path=path, line=first + 1)
@@ -250,30 +249,3 @@ def _require_alike(by_yaw: FloatArray, by_omega: FloatArray, table: tables.Table
         lines=table.lines,
         field="omega,phi,kappa",
     )
-
-
-def _times(table: tables.Table) -> tuple[FloatArray, bool]:
-    """Return seconds since 1970 (N,), of numbers or ISO 8601, and whether an ISO 8601 time has no zone."""
-    moments = [_time(row) for row in table.rows]
-    times = np.array([seconds for seconds, _ in moments])
-    tables.refuse_first(
-        np.abs(times) > _LATEST_S,
-        "time-unit",
-        lambda row: f"the time {times[row]:.0f} is probably in milliseconds or finer: give seconds since 1970",
-        path=table.path,
-        lines=table.lines,
-        field="timestamp",
-    )
-    return times, any(zoneless for _, zoneless in moments)
-
-
-def _time(row: tables.Row) -> tuple[float, bool]:
-    text = row.text("timestamp")
-    if text[4:5] != "-" or len(text) < 10:
-        return row.number("timestamp"), False
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError:
-        raise row.fault("time-invalid", f"{text!r} is not an ISO 8601 time", "timestamp") from None
-    zoneless = moment.tzinfo is None
-    return (moment.replace(tzinfo=UTC) if zoneless else moment).timestamp(), zoneless

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.gnss_logs import unix_from_gps
+from pipelines.formats.gps_time import unix_from_gps
 
 # Atomic time is ahead of GPS time, by definition.
 _TAI_FROM_GPS_S = 19.0

@@ -41,6 +41,8 @@ Kind = Literal["control points", "check points"]
 _CONTROL: Kind = "control points"
 _CHECK: Kind = "check points"
 
+_FEWEST_FRACTIONS = 3  # marks, of which all lie within the first pixel
+
 
 @dataclass(frozen=True)
 class GroundPoint:
@@ -243,9 +245,23 @@ def _tied(
                 path=path,
                 field="image",
             )
+        _require_pixels(path, listed, sizes)
         remarks.warn_counted("mark-in-unknown-image", unknown, "Marks are in images that are not here")
     by_hand = {name: tuple(of_point.values()) for name, of_point in marks.items()}
     return by_hand if targets is None else {name: targets.beside(name, mine) for name, mine in by_hand.items()}
+
+
+def _require_pixels(path: Path, listed: Sequence[ListedMark], sizes: Mapping[str, tuple[int, int]]) -> None:
+    """Refuse marks all of which lie within the first pixel: they are fractions of the image's sides."""
+    within = all(mark.x_px <= 1.0 and mark.y_px <= 1.0 for mark in listed)
+    if len(listed) >= _FEWEST_FRACTIONS and within and min(map(min, sizes.values())) > 2:
+        raise InputError(
+            "marks-are-fractions",
+            f"All {len(listed)} marks lie within the first pixel of their images: they are fractions of the "
+            "width and height. Write them in pixels.",
+            path=path,
+            field="px py",
+        )
 
 
 def known_distances(

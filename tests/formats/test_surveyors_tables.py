@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
-from pipelines.formats.gnss_logs import read_mrk, read_pos, unix_from_gps, unix_from_week
+from pipelines.formats.gnss_logs import read_mrk, read_pos
+from pipelines.formats.gps_time import unix_from_gps, unix_from_week
 from pipelines.formats.ground_points import read_marks, read_point_table
 from pipelines.formats.metashape import read_cameras, read_markers, read_markers_xml
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla

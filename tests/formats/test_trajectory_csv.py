@@ -46,6 +46,66 @@ def test_ways_to_write_the_same(tmp_path: Path, text: str) -> None:
     np.testing.assert_array_equal(table.xyz, EXPECTED)
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])
+def test_unicode_text_of_a_spreadsheet(tmp_path: Path, encoding: str) -> None:
+    """With a byte order mark the encoding is known; without one the file is refused (see below)."""
+    mark = "" if encoding == "utf-16" else "\ufeff"
+    table = _read(tmp_path, (mark + PLAIN.replace(",", "\t")).encode(encoding))
+    np.testing.assert_array_equal(table.xyz, EXPECTED)
+
+
+NOON_S = 1714564800.0  # 2024-05-01 12:00:00 UTC
+
+
+@pytest.mark.parametrize(
+    ("header", "cells", "seconds", "zoneless"),
+    [
+        ("time", "2024-05-01T12:00:00.25Z", 0.25, False),
+        ("time", "2024/05/01 12:00:00.25", 0.25, True),
+        ("datetime", "2024:05:01 12:00:00", 0.0, True),  # as EXIF writes it
+        ("date,time", "2024-05-01,12:00:00.25", 0.25, True),
+        ("Date,UTC Time", "2024/05/01,12:00:00.25Z", 0.25, False),
+        ("date,time", "31.05.2024,9:00:01", 30 * 86400.0 - 3 * 3600.0 + 1.0, True),
+        ("date,time", "05/31/2024,12:00:00", 30 * 86400.0, True),
+        ("date,time", "20240501,14:00:00+02:00", 0.0, False),
+        ("gps_week,tow", "2312,302418.5", 0.5, False),  # GPS time is 18 s ahead
+        ("GPS Week,Time of Week [s]", "2312,302418.5", 0.5, False),
+        ("week,time", "2312,302418.5", 0.5, False),
+    ],
+)
+def test_ways_to_write_a_time(tmp_path: Path, header: str, cells: str, seconds: float, zoneless: bool) -> None:
+    table = _read(tmp_path, f"{header},latitude,longitude,altitude\n{cells},46.02,7.75,620\n")
+    assert table.time_s is not None
+    assert table.time_s[0] == pytest.approx(NOON_S + seconds, abs=1e-6)
+    assert table.zoneless_times == zoneless
+
+
+@pytest.mark.parametrize(
+    ("header", "cells", "code", "field"),
+    [
+        ("time", "12:00:00", "time-without-date", "timestamp"),
+        ("date,time", "05/06/2024,12:00:00", "date-ambiguous", "date"),
+        ("date,time", "31/31/2024,12:00:00", "date-invalid", "date"),
+        ("date,time", "2024-13-01,12:00:00", "date-invalid", "date"),
+        ("date,time", "1 May,12:00:00", "date-invalid", "date"),
+        ("week,tow", "264,302418.5", "value-out-of-range", "week"),  # counted from 2019 on, or from 1999?
+        ("week,tow", "2312,302418500", "value-out-of-range", "tow"),  # milliseconds
+        ("time", "1714564800000", "time-unit", "timestamp"),
+    ],
+)
+def test_times_that_are_not_known(tmp_path: Path, header: str, cells: str, code: str, field: str) -> None:
+    with refused(code) as error:
+        _read(tmp_path, f"{header},latitude,longitude,altitude\n{cells},46.02,7.75,620\n")
+    assert (error.value.line, error.value.field) == (2, field)
+
+
+def test_one_date_tells_the_order_of_all(tmp_path: Path) -> None:
+    rows = "05/06/2024,12:00:00,46.02,7.75,620\n14/06/2024,12:00:00,46.02,7.75,620\n"
+    table = _read(tmp_path, "date,time,latitude,longitude,altitude\n" + rows)
+    assert table.time_s is not None
+    assert table.time_s[1] - table.time_s[0] == 9 * 86400.0
+
+
 def test_all_columns(tmp_path: Path) -> None:
     table = _read(
         tmp_path,

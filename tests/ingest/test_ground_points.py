@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 
 from pipelines.core.errors import InputError
@@ -67,6 +68,12 @@ def test_points_and_marks(tmp_path: Path) -> None:
         ("7.75 46.02 1620 -1 20 a.jpg G1\n", "mark-outside-image", (2, "px py"), r"a\.jpg \(64×48 px\)"),
         ("7.75 46.02 1620 1 1 x.jpg G1\n", "no-image-matched", (None, "image"), r"'x\.jpg' .*'a\.jpg' …"),
         ("7.75 46.02 1620 1 1 ../a.jpg G1\n", "image-outside-folder", (2, "image"), "../a.jpg"),
+        (
+            re.sub(r"1620 (\d)\d\.5 \d\d\.5", r"1620 0.\1 0.4", G1 + G2),
+            "marks-are-fractions",
+            (None, "px py"),
+            "All 4",
+        ),
         ("46.02 97.75 1620 1 1 a.jpg G1\n", "latitude-range", (2, "latitude"), "x is the longitude"),
     ],
 )
@@ -75,6 +82,14 @@ def test_refusals(tmp_path: Path, rows: str, code: str, place: tuple[int | None,
         _read(tmp_path, rows)
     assert (error.value.line, error.value.field) == place and error.value.path.name == "gcp_list.txt"
     assert re.search(says, error.value.message)
+
+
+@pytest.mark.parametrize("version", ["WKT1_GDAL", "WKT1_ESRI", "WKT2_2019"])
+def test_the_first_line_may_be_wkt(tmp_path: Path, version: str) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(pyproj.CRS("EPSG:32632").to_wkt(version) + "\n403300 5097000 500 10 20 a.jpg G1\n")
+    file, _ = read_ground_files(IngestOptions(gcp=path), Remarks())
+    assert file is not None and file.crs.xyz_from_lla([[46.0, 9.0, 0.0]])[0, 0] == pytest.approx(500_000.0)
 
 
 def test_one_point_has_one_place(tmp_path: Path) -> None:
