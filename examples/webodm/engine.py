@@ -91,7 +91,7 @@ def run_words(given: argparse.Namespace, project: Path) -> list[str]:
     if given.gps_accuracy > 0:
         words += [f"--sigma-h={given.gps_accuracy}", f"--sigma-v={given.gps_accuracy}"]
     if given.rerun_from and (project / "workspace").is_dir():
-        words.append(f"--rerun-from={STEPS[given.rerun_from]}")
+        words += [f"--from={STEPS[given.rerun_from]}", "--force"]
     if last < steps.index("openmvs"):
         words.append(f"--to={STEPS[given.end_with]}")
     sets: dict[str, Any] = {}

@@ -84,7 +84,7 @@ command = Command(
             metavar="N",
             help="Run at most this many missions at a time (default: as many as cores and predicted memory allow).",
         ),
-        click.Option(["--to", "--end-with", "last"], type=STAGE_NAME, help="Last stage to run, of every mission."),
+        click.Option(["--to", "last"], type=STAGE_NAME, help="Last stage to run, of every mission."),
         DELIVER,
         SET,
         *ENGINE,

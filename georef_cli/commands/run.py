@@ -66,11 +66,8 @@ DELIVER = click.Option(
 
 
 def _run(ctx: click.Context, **values: Any) -> None:
-    if values["first"] and values["rerun_from"]:
-        raise click.UsageError("--from and --rerun-from exclude each other.")
-    first = values["first"] or values["rerun_from"]
     try:
-        stages = stage_slice(first, values["last"])
+        stages = stage_slice(values["first"], values["last"])
     except GeorefError as error:
         raise click.UsageError(str(error)) from error
     workspace, wanted = values["workspace"], deliverables(values["deliver"])
@@ -79,7 +76,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
         raise click.UsageError("--deliver needs a trained model, which this run does not make: leave out --to.")
     stages += wanted
     flags = _flags(ctx, stages, settings(values["settings"], stages, _later(stages)))
-    forget, force = _forgotten(values["forget"], stages), values["force"] or values["rerun_from"] is not None
+    forget, force = _forgotten(values["forget"], stages), values["force"]
     if stages[0].reads:
         must_exist(workspace)
     asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
@@ -197,7 +194,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "Most runs need": (
         "images", "trajectory", "vertical", "crs", "gcp", "checkpoints", "preset", "deliver", "dry_run", "last",
     ),
-    "Which stages": ("first", "rerun_from", "force", "forget", "settings", "as_json"),
+    "Which stages": ("first", "force", "forget", "settings", "as_json"),
     "Photographs": (
         "sensor", "bag", "video", "image_topic", "fix_topic", "attitude_topic", "every", "skip_blurred", "focal_px",
         "rolling_shutter", "masks", "mask", "mask_sky", "copy_images", "test_every",
@@ -224,8 +221,7 @@ command = Command(
     params=[
         options.WORKSPACE,
         click.Option(["--from", "first"], type=STAGE_NAME, help="First stage to run."),
-        click.Option(["--rerun-from"], type=STAGE_NAME, help="First stage to run, with --force."),
-        click.Option(["--to", "--end-with", "last"], type=STAGE_NAME, help="Last stage to run."),
+        click.Option(["--to", "last"], type=STAGE_NAME, help="Last stage to run."),
         *(options.stage_option(BY_NAME[owners[0]].options, name) for name, owners in OWNERS.items()),
         DELIVER,
         SET,

@@ -94,6 +94,6 @@ def test_commands_on_simulated_surveys_and_bags_run(folder: Path, document: str)
         if own[0] == "run":
             (folder / own[1]).mkdir(exist_ok=True)
             (folder / own[1] / "georef.toml").write_text(TINY, "utf-8")
-            own += ["--end-with", "ingest"]  # these surveys are too small for more
+            own += ["--to", "ingest"]  # these surveys are too small for more
         done = call(own, folder)
         assert done.returncode == 0, f"georef {shlex.join(own)}\n{done.stdout}\n{done.stderr}"

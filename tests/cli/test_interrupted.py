@@ -81,11 +81,10 @@ def test_the_same_options_continue(georef: Georef, interrupted: Path, words: tup
     assert not (interrupted / "train/progress.txt").exists()
 
 
-@pytest.mark.parametrize("words", [("run", "--rerun-from", "train"), ("train",)])
+@pytest.mark.parametrize("words", [("run", "--from", "train"), ("train",)])
 def test_force_drops_it(georef: Georef, interrupted: Path, words: tuple[str, ...]) -> None:
     command, *options = words
-    forced = () if "--rerun-from" in options else ("--force",)
-    assert georef(command, interrupted, *options, "--preset", "high", *forced).code == 0
+    assert georef(command, interrupted, *options, "--preset", "high", "--force").code == 0
     assert training(interrupted) == (False, "high")
 
 

@@ -71,11 +71,3 @@ def test_status_shows_options_with_their_origin(georef: Georef, done: Path, phot
     text = georef("status", done, "--options").out
     assert "--import" in text and "remembered" in text and "georef.toml" in text
     assert "options" not in georef("status", done, "--json").document
-
-
-def test_aliases_of_other_programs(georef: Georef, done: Path) -> None:
-    result = georef("run", done, "--rerun-from", "sfm", "--end-with", "calibrate", "--json")
-    stages = result.document["stages"]
-    assert (stages[0]["stage"], stages[-1]["stage"]) == ("sfm", "calibrate")
-    assert all(row["ran"] for row in stages)
-    georef("run", done, "--from", "sfm", "--rerun-from", "sfm").assert_failed(2)

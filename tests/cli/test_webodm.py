@@ -198,9 +198,9 @@ def test_options_reach_the_stages(engine: ModuleType, project: Path) -> None:
     )
     assert "--set=export-spz.crop=true" in words() and "--set=export-spz.crop=true" not in words("--crop", "0")
     assert "--vertical=EGM96; rm -r /" in words("--vertical", "EGM96; rm -r /")  # one word, which georef refuses
-    assert not any("rerun" in word for word in words("--rerun-from", "opensfm"))  # nothing was run here
+    assert "--force" not in words("--rerun-from", "opensfm")  # nothing was run here
     (project / "workspace").mkdir()
-    assert "--rerun-from=sfm" in words("--rerun-from", "opensfm")
+    assert {"--from=sfm", "--force"} <= set(words("--rerun-from", "opensfm"))
 
 
 def test_what_is_asked_and_not_done_is_said(engine: ModuleType, project: Path) -> None:
