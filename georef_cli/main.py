@@ -1,5 +1,7 @@
 """Group `georef`: a table of commands, each imported when it is called.
 
+A module of `georef_cli.commands` holds a `command`, or a function of that name that returns one of several by name.
+
 `georef --help` reads the table alone, to answer at once. It imports no command module, and therefore neither the
 validation library nor any heavier one.
 """
@@ -18,6 +20,7 @@ import click
 from georef_cli import boundary
 from georef_cli.command import Command, merged_verbosity, shared_options
 from georef_cli.native_lines import native_lines_logged
+from pipelines.core.stages import CHANGE, DELIVERABLES, PIPELINE, SPLAT, StageSpec
 from pipelines.core.version import described_version
 
 PROGRAM = "georef"
@@ -34,6 +37,23 @@ class HelpLine:
 
     section: str
     help: str
+    module: str = ""  # of several commands, in `georef_cli.commands`; empty: a module of its own
+
+
+# Stages whose commands do more than run them, in modules of their own.
+_OF_THEIR_OWN = frozenset({"sfm", "calibrate", "evaluate", "export-ply"})
+
+
+def _of_stages(*stages: StageSpec) -> dict[str, HelpLine]:
+    return {
+        spec.name: HelpLine(
+            "Stages" if spec in PIPELINE and spec.product != SPLAT else "Deliverables",
+            spec.title,
+            "" if spec.name in _OF_THEIR_OWN else "stages",
+        )
+        for spec in stages
+        if not spec.called
+    }
 
 
 COMMANDS: dict[str, HelpLine] = {
@@ -42,30 +62,17 @@ COMMANDS: dict[str, HelpLine] = {
     "run": HelpLine("Pipeline", "Run all stages, or some, skipping what is current."),
     "batch": HelpLine("Pipeline", "Run many missions, and put their results into one table."),
     "blocks": HelpLine("Pipeline", "Train a large survey in blocks, and merge them."),
-    "cluster certificates": HelpLine("Pipeline", "Make the certificate that the machines of a cluster share."),
-    "cluster scheduler": HelpLine("Pipeline", "Start the scheduler of a cluster."),
-    "cluster worker": HelpLine("Pipeline", "Lend this machine to a cluster."),
+    "compare": HelpLine("Pipeline", "Run the ablation and put its figures into one table."),
+    "cluster certificates": HelpLine(
+        "Pipeline", "Make the certificate that the machines of a cluster share.", "cluster"
+    ),
+    "cluster scheduler": HelpLine("Pipeline", "Start the scheduler of a cluster.", "cluster"),
+    "cluster worker": HelpLine("Pipeline", "Lend this machine to a cluster.", "cluster"),
     "status": HelpLine("Pipeline", "Show the state of every stage."),
     "info": HelpLine("Pipeline", "Show where on Earth the result is, and what each file is for."),
     "view": HelpLine("Pipeline", "See the trained model in a browser, and measure in it."),
     "marks": HelpLine("Pipeline", "Propose marks of ground points in the photographs that lack them."),
-    "ingest": HelpLine("Stages", "Read photographs, positions and control points into one survey."),
-    "sfm": HelpLine("Stages", "Reconstruct cameras and points with COLMAP."),
-    "calibrate": HelpLine("Stages", "Estimate time offset, boresight and lever arm after sfm."),
-    "compare": HelpLine("Pipeline", "Run the ablation and put its figures into one table."),
-    "geolocate": HelpLine("Stages", "Intersect every SfM point on Earth."),
-    "init-sim3": HelpLine("Stages", "Estimate the similarity from the SfM model to the Earth."),
-    "train": HelpLine("Stages", "Train the Gaussians with the similarity and the cameras."),
-    "evaluate": HelpLine("Stages", "Measure test views and check points."),
-    "export-ply": HelpLine("Deliverables", "Write the splat as a PLY with its place on Earth."),
-    "export-raster": HelpLine("Deliverables", "Write orthophoto, surface model and σ as rasters."),
-    "export-cloud": HelpLine("Deliverables", "Write the surface as a georeferenced point cloud (LAZ)."),
-    "export-mesh": HelpLine("Deliverables", "Write the surface as a triangle mesh with texture."),
-    "export-spz": HelpLine("Deliverables", "Write the splat as SPZ, for viewers on the web."),
-    "export-tiles": HelpLine("Deliverables", "Write the splat as 3D Tiles, for web globes."),
-    "export-cameras": HelpLine("Deliverables", "Write the trained cameras for other programs."),
-    "report": HelpLine("Deliverables", "Write the report: one page, and its PDF."),
-    "change": HelpLine("Deliverables", "Compare two surveys: what changed, by how much, is it real."),
+    **_of_stages(*PIPELINE, *DELIVERABLES, CHANGE),
     "help": HelpLine("Start", "Explain a topic, such as heights or options, or a command."),
     "doctor": HelpLine("Start", "Show what this machine offers: memory, GPU, backends, geoid grids."),
 }
@@ -74,8 +81,8 @@ TOGETHER = {"cluster": "Lend machines to a cluster: certificates, scheduler, wor
 
 
 def module_of(name: str) -> str:
-    """Return the module in `georef_cli.commands` that defines a `command` of the table."""
-    return name.replace("-", "_").replace(" ", "_")
+    """Return the module in `georef_cli.commands` that defines a command of the table."""
+    return COMMANDS[name].module or name.replace("-", "_")
 
 
 class LazyGroup(click.Group):
@@ -87,7 +94,8 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        command = importlib.import_module(f"georef_cli.commands.{module_of(cmd_name)}").command
+        found = importlib.import_module(f"georef_cli.commands.{module_of(cmd_name)}").command
+        command = found if isinstance(found, Command) else found(cmd_name)
         assert isinstance(command, Command)
         return command
 

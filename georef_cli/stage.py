@@ -4,6 +4,7 @@ Copies of products outside the workspace are complete or absent, and never over 
 """
 
 import contextlib
+import inspect
 import os
 import shutil
 import tempfile
@@ -36,6 +37,7 @@ class StageCommand(Command):
     """Command `georef STAGE WS …`: the options of the stage, `--force` and `--json`.
 
     Args:
+        doc: what `--help` says below the title of the stage.
         extra: further options.
         before: argument before the workspace, which is an option of the stage.
         delivers: what `--to` copies: the stage's whole folder, or one file with its sidecars; None: nothing.
@@ -78,7 +80,7 @@ class StageCommand(Command):
                 options.flag("--force", text="Run even if the product is current."),
                 options.JSON,
             ],
-            help=doc,
+            help=f"{self.spec.title}\n\n{inspect.cleandoc(doc)}",
             callback=click.pass_context(self.act),
         )
 

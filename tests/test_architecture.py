@@ -291,7 +291,7 @@ def test_building_the_commands_imports_nothing_heavy() -> None:
 
 
 def test_table_of_commands_is_complete() -> None:
-    """Every module in commands/ is a command, and every command has its module."""
+    """Every module in commands/ holds commands, and every command has its module."""
     modules = {path.stem for path in (REPOSITORY / "georef_cli/commands").glob("*.py")} - {"__init__"}
     assert modules == set(map(module_of, COMMANDS))
     assert {spec.name for spec in PIPELINE} <= set(COMMANDS)

@@ -44,8 +44,7 @@ def _estimates(calibration: RigCalibration) -> Table:
 
 command = StageCommand(
     "calibrate",
-    """Estimate time offset, boresight and lever arm from the SfM cameras.
-
+    """
     After sfm, the track of the cameras is fitted to the navigation that ingest recorded from a bag or a trajectory
     by time. Each parameter is stated with its σ. A parameter that the flight does not determine is reported as not
     observable, and is not applied. Parameters requested in ingest (--time-offset auto, --estimate) are applied to

@@ -21,8 +21,7 @@ def _tables(workspace: Workspace, values: Mapping[str, Any]) -> list[Group]:
 
 command = StageCommand(
     "evaluate",
-    """Measure test views and check points.
-
+    """
     Without training, the cameras of init-sim3 are evaluated alone. Check points are triangulated (their marks
     intersected) and measured on the rendered surface (the depth of the Gaussians at the marks, not their
     centres), and stated as the ASPRS standard asks. The predicted accuracy over the scene is drawn in

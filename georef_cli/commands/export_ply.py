@@ -8,8 +8,7 @@ from georef_cli import options
 from georef_cli.stage import StageCommand
 from pipelines.deliver.options import MeasurableOptions
 
-_DOC = """Write the splat as a PLY with its place on Earth.
-
+_DOC = """
     The PLY is in an East-North-Up frame in metres; --up turns it for viewers whose y axis points up or down.
     FILE.georef.json beside it states the place of the file's frame on Earth, and its accuracy.
 

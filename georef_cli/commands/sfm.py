@@ -32,8 +32,7 @@ class _SfmCommand(StageCommand):
 
 command = _SfmCommand(
     "sfm",
-    """Reconstruct cameras and points with COLMAP.
-
+    """
     Which images are matched follows from their positions and view directions. Features and matches of a large
     survey are computed in chunks, as many at a time as cores and memory allow; a finished chunk is kept when the
     command is interrupted. The result is a COLMAP model, sfm/sparse, which COLMAP itself opens; --import takes a

@@ -3,12 +3,17 @@
 `georef status` and `--help` read this table without importing a stage.
 """
 
+from __future__ import annotations
+
 import importlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import StageOptions, listed_names
+
+if TYPE_CHECKING:
+    from pipelines.core.options import StageOptions
 
 SURVEY = "ingest/survey.json"
 MASKS = "ingest/masks"  # of the photographs that have one
@@ -120,7 +125,7 @@ class StageSpec:
         options_place: `module:class` of its options.
         reads: products, or parts of them, that decide its result.
         product: workspace path of its main product, whose first part is the stage's folder.
-        title: what its command makes, of a deliverable that has not been made yet.
+        title: what its command does, in one sentence; empty without a command of its own.
         resumable: whether a partial product can be continued.
         growing: options of which a larger value continues the finished product.
         also: further products in its folder, besides those that the stages of the pipeline read.
@@ -169,6 +174,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.ingest.options:IngestOptions",
         reads=(),
         product=SURVEY,
+        title="Read photographs, positions and control points into one survey.",
         working=("images", "masks"),
         product_version=2,  # as `Survey.format_version`
     ),
@@ -178,6 +184,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.sfm.options:SfmOptions",
         reads=(PHOTOGRAPHS,),
         product=SPARSE,
+        title="Reconstruct cameras and points with COLMAP.",
         resumable=True,
         working=("database.db",),
     ),
@@ -187,6 +194,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.adjust.options:CalibrateOptions",
         reads=(MEASURED, *whole_products(SPARSE), ProductPart(TRACK, optional=True)),
         product=RIG,
+        title="Estimate time offset, boresight and lever arm after sfm.",
         product_version=2,  # with the lag of positions by photograph
     ),
     StageSpec(
@@ -195,6 +203,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.adjust.options:GeolocateOptions",
         reads=(MEASURED, *whole_products(SPARSE), APPLIED_RIG),
         product=POINTS,
+        title="Intersect every SfM point on Earth.",
     ),
     StageSpec(
         name="init-sim3",
@@ -202,6 +211,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.adjust.options:InitSim3Options",
         reads=(MEASURED, *whole_products(SPARSE, POINTS), APPLIED_RIG),
         product=SIM3,
+        title="Estimate the similarity from the SfM model to the Earth.",
         product_version=2,  # beside the similarity, the adjustment
         also=(ADJUSTMENT, SIM3_POSTERIOR),
     ),
@@ -211,6 +221,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.train.options:TrainOptions",
         reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT, SIM3_POSTERIOR, POINTS), APPLIED_RIG),
         product=MODEL,
+        title="Train the Gaussians with the similarity and the cameras.",
         resumable=True,
         growing=("iterations",),
         also=(TRAIN_POSTERIOR,),
@@ -223,6 +234,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.evaluate.options:EvaluateOptions",
         reads=(MEASURED, *SOLVED, APPLIED_RIG),
         product=REPORT,
+        title="Measure test views and check points.",
         product_version=4,  # with the area that is measured
     ),
     StageSpec(
@@ -231,6 +243,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.deliver.options:ExportPlyOptions",
         reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *CROPPED_BY, APPLIED_RIG, HEADLINE),
         product=SPLAT,
+        title="Write the splat as a PLY with its place on Earth.",
     ),
 )
 
@@ -254,7 +267,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         options_place="pipelines.deliver.options:ExportRasterOptions",
         reads=(MEASURED, *whole_products(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product="raster/orthophoto.tif",
-        title="Write orthophoto, surface model and their σ as rasters in a CRS.",
+        title="Write orthophoto, surface model and σ as rasters.",
         resumable=True,
         also=("raster/dsm.tif", "raster/measured.tif", "raster/sigma_h.tif", "raster/sigma_v.tif"),
         product_version=2,  # whole inside the area of interest
@@ -274,7 +287,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         options_place="pipelines.deliver.options:ExportMeshOptions",
         reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
         product=MESH,
-        title="Write the surface as a triangle mesh with texture (PLY, glTF, OBJ).",
+        title="Write the surface as a triangle mesh with texture.",
         resumable=True,
         also=(MESH_GLB,),
     ),
@@ -301,7 +314,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         options_place="pipelines.deliver.options:ExportCamerasOptions",
         reads=(MEASURED, *SOLVED, APPLIED_RIG, HEADLINE),
         product="cameras/cameras.csv",
-        title="Write the adjusted cameras with their covariances for COLMAP, nerfstudio, surveyors and maps.",
+        title="Write the trained cameras for other programs.",
         also=(
             "cameras/colmap",
             "cameras/transforms.json",
@@ -326,7 +339,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
             ),
         ),
         product=REPORT_PAGE,
-        title="Write the report of the survey: one page with all that is known of it.",
+        title="Write the report: one page, and its PDF.",
     ),
 )
 
@@ -342,7 +355,7 @@ CHANGE = StageSpec(
         *whole_products(*("raster/dtm.tif", "raster/sigma_dtm.tif", "raster/orthophoto.tif", CLOUD), optional=True),
     ),
     product=CHANGE_FIGURES,
-    title="Compare with an earlier survey: what changed, by how much, is it real.",
+    title="Compare two surveys: what changed, by how much, is it real.",
     also=(
         "change/difference.tif",
         "change/sigma.tif",
@@ -430,6 +443,8 @@ def products_of(spec: StageSpec) -> tuple[str, ...]:
 
 def named_deliverables(names: str | None) -> tuple[StageSpec, ...]:
     """Return the stages of the deliverables in a text (`raster,cloud`, `all`); a ValueError: one is unknown."""
+    from pipelines.core.options import listed_names  # and the validation library, which the help does without
+
     by_name = {spec.name.removeprefix("export-"): spec for spec in DELIVERABLES}
     listed = () if names is None else listed_names(names, (*by_name, "all"))
     return tuple(spec for name, spec in by_name.items() if name in listed or "all" in listed)
