@@ -327,12 +327,15 @@ def _open_rotation(data: Correspondences, candidates: Sequence[AdjustedSimilarit
     length_m, width_m = (scale * float(np.ptp(centred @ axis)) for axis in axes[:2])
     variance = np.median(np.diagonal(data.cov_in_geo, axis1=1, axis2=2), axis=0)
     sigma_h_m, sigma_v_m = float(np.sqrt(variance[:2].mean())), float(np.sqrt(variance[2]))
+    options = [] if data.control.all() else ["--sigma-h and --sigma-v of the positions"]
+    options += ["--sigma-gcp-h and --sigma-gcp-v of the control points"] if data.control.any() else []
+    measured = "control points" if data.control.all() else "positions"
     return DegenerateGeometryError(
         "block-too-small",
-        f"The {len(data)} positions span {length_m:.0f} × {width_m:.0f} m, which is small against their σ of "
+        f"The {len(data)} {measured} span {length_m:.0f} × {width_m:.0f} m, which is small against their σ of "
         f"{sigma_h_m:.2g} m horizontally and {sigma_v_m:.2g} m vertically: the rotation of the block {size}, and "
         f"more than {np.degrees(_WORST_ROTATION_RAD):.0f}° are not used. State better σ if they are known "
-        f"(--sigma-h, --sigma-v). {_ADVICE}",
+        f"({', '.join(options)}). {_ADVICE}",
     )
 
 

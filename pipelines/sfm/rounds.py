@@ -61,8 +61,7 @@ def align(colmap: Any, job: SfmJob, progress: Progress) -> Alignment:
         _add_learned(colmap, job, candidate_pairs(job.survey, job.options), progress)
     best = Alignment(*map_database(colmap, job, progress))
     best = _with_lens_held(colmap, job, best, progress)
-    wanting = best.covered() < len(job.survey.images) and not _whole(best, job.survey)
-    if wanting and job.options.features == "auto" and missing_for_learned() is None:
+    if not _whole(best, job.survey) and job.options.features == "auto" and missing_for_learned() is None:
         pairs = _pairs_to_add(colmap, job, best)
         if len(pairs) and _add_learned(colmap, job, pairs, progress):
             again = Alignment(*map_database(colmap, job, progress, lens_held=best.lens_held), best.lens_held)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -128,6 +130,10 @@ def test_a_small_block_is_no_line() -> None:
     with refused("block-too-small", DegenerateGeometryError) as error:
         align(grid(12.0), np.random.default_rng(0))
     assert numbers(str(error.value))[0] == 9 and {2.5, 5.0} <= set(numbers(str(error.value)))
+    assert "--sigma-h" in str(error.value) and "--sigma-gcp-h" not in str(error.value)
+    with refused("block-too-small", DegenerateGeometryError) as error:
+        align(replace(grid(12.0), control=np.ones(9, dtype=bool)), np.random.default_rng(0))
+    assert "--sigma-gcp-h" in str(error.value) and "--sigma-h" not in str(error.value)
     with refused("positions-on-a-line", DegenerateGeometryError):
         align(grid(0.5), np.random.default_rng(0))
 
