@@ -70,10 +70,14 @@ def read_lines(path: Path) -> list[str]:
     """
     lines: list[str] = []
     file_size(path, limit_bytes=MAX_BYTES, kind="text table")
-    with reading(path), path.open(encoding=_encoding(path), errors="surrogateescape") as handle:
-        while text := handle.readline(LONGEST_LINE + 1):
-            _check_line(text, path, len(lines) + 1)
-            lines.append(text.removesuffix("\n"))
+    try:
+        with reading(path), path.open(encoding=_encoding(path), errors="surrogateescape") as handle:
+            while text := handle.readline(LONGEST_LINE + 1):
+                _check_line(text, path, len(lines) + 1)
+                lines.append(text.removesuffix("\n"))
+    except UnicodeDecodeError as error:  # of UTF-16; what is no UTF-8 is found line by line
+        message = "The file begins as UTF-16 does, and is none: save it as UTF-8."
+        raise InputError("not-text", message, path=path) from error
     if not any(map(str.strip, lines)):
         raise InputError("file-empty", "The file is empty.", path=path)
     return lines

@@ -62,7 +62,8 @@ REFUSED = (
     Case("empty table", {"t.csv": b" \n"}, CSV, "t.csv file-empty"),
     Case("header only", {"t.csv": b"image,lat,lon,alt\n"}, CSV, "t.csv no-rows"),
     Case("no header", {"t.csv": b"IMG_0000.JPG,46,7,500\n"}, CSV, "[--trajectory] header-missing"),
-    Case("not text", {"t.csv": b"\xff\xfe\x00"}, CSV, "t.csv:1 not-utf8"),
+    Case("not text", {"t.csv": b"\xff\xfd\x00"}, CSV, "t.csv:1 not-utf8"),
+    Case("half a UTF-16", {"t.csv": b"\xff\xfe\x00"}, CSV, "t.csv not-text"),
     Case("no number", {"t.csv": positions("IMG_0003.JPG,46.02,east,500")}, CSV, "t.csv:5 [longitude] not-a-number"),
     Case(
         "decimal commas between commas",
