@@ -35,6 +35,7 @@ from pipelines.survey.survey import Survey
 log = logging.getLogger(__name__)
 
 _LARGEST_RELATIVE_SIGMA = 0.3  # of the distance: beyond, the linear covariance is invalid
+_MOST = 0.5  # of the points: fewer are a warning
 _ALIGNMENT_SEED = 0
 
 
@@ -102,16 +103,29 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     rays = _rays(model, usable)
     intersections = intersect_rays(rays, views, len(model.point_id))
     sigma, inlier = _judge(intersections, rays, views, options)
-    if inlier.sum() < 0.5 * len(inlier):
-        sentence = (
-            f"The rays of only {inlier.sum()} of {len(inlier)} points meet within their σ. Check the attitudes, "
-            "and the σ of fixes and attitudes (--sigma-h, --sigma-v, --sigma-attitude of `georef ingest`)."
-        )
-        warnings.append(Remark(code="few-points-agree", sentence=sentence))
+    if inlier.sum() < _MOST * len(inlier):
+        warnings.append(_few_points(inlier, intersections.consistent))
     middle = f", median σ {np.median(sigma[inlier]):.3g} m" if inlier.any() else ""
     source = "recorded" if use_recorded else "sfm"
     figure = f"{inlier.sum()} of {len(inlier)} points{middle} ({source} rotations)"
     return Geolocation(_points(model, intersections, inlier, source), sigma, figure, tuple(warnings))
+
+
+def _few_points(inlier: BoolArray, consistent: BoolArray) -> Remark:
+    """Return the warning that few of the points are located: their rays disagree, or leave them open."""
+    if consistent.sum() < _MOST * len(inlier):
+        return Remark(
+            code="few-points-agree",
+            sentence=f"The rays of only {consistent.sum()} of {len(inlier)} points meet within their σ. Check the "
+            "attitudes, and the σ of fixes and attitudes (--sigma-h, --sigma-v, --sigma-attitude of `georef "
+            "ingest`).",
+        )
+    return Remark(
+        code="few-points-located",
+        sentence=f"The rays of {consistent.sum()} of {len(inlier)} points meet within their σ, but only "
+        f"{inlier.sum()} points are known to {100 * _LARGEST_RELATIVE_SIGMA:.0f} % of their distance: the σ of the "
+        "positions or of the attitudes leave the others open.",
+    )
 
 
 def _without_positions(model: SparseModel, why: str) -> Geolocation:

@@ -42,7 +42,8 @@ def unregistered(colmap: Any, database: Path, model: Any, remedy: str = "") -> t
         return ()
     reasons = [f"{names[one]}: {_reason(matches[one], shared[one], names)}" for one in lost[:_MOST_LISTED]]
     more = f"; and {len(lost) - _MOST_LISTED} more" if len(lost) > _MOST_LISTED else ""
-    sentence = f"{len(lost)} photographs are not registered. {'; '.join(reasons)}{more}.{remedy}"
+    many = "photographs are" if len(lost) > 1 else "photograph is"
+    sentence = f"{len(lost)} {many} not registered. {'; '.join(reasons)}{more}.{remedy}"
     return (Remark(code="photographs-not-registered", sentence=sentence),)
 
 

@@ -158,6 +158,34 @@ def test_line_without_attitudes_has_no_located_points_and_recorded_ones_are_refu
     assert error.value.field == "--attitude" and numbers(error.value.message)[0] == 0
 
 
+def test_attitudes_of_a_large_sigma_are_not_said_to_disagree() -> None:
+    """Rays that meet within σ, and σ that leave the points open, are two things."""
+    scene, rng = make_scene(points=60), np.random.default_rng(0)
+    survey = survey_of(scene, Noise(), Measured(), rng)
+    unsure = [
+        image.model_copy(
+            update={"attitude": image.attitude and image.attitude.model_copy(update={"sigma_deg": 170.0})}
+        )
+        for image in survey.images
+    ]
+    survey = survey.model_copy(update={"images": tuple(unsure)})
+    found = geolocate(survey, sparse_model(scene, Noise(), rng), GeolocateOptions(attitude="recorded"))
+    assert found.points.inlier.sum() < 30
+    agree, total, known, part = numbers(said(found.warnings, "few-points-located"))
+    assert agree > 50 and total == 60 and (known, part) == (found.points.inlier.sum(), 30.0)
+
+
+def test_attitudes_that_are_wrong_make_rays_disagree() -> None:
+    scene, rng = make_scene(points=60), np.random.default_rng(0)
+    wrong = iter(rng.normal(0.0, np.radians(20.0), (len(scene.names), 3)))
+    survey = turned_attitudes(
+        survey_of(scene, Noise(), Measured(), rng), scene.names, lambda rotation: exp_so3(next(wrong)) @ rotation
+    )
+    found = geolocate(survey, sparse_model(scene, Noise(), rng), GeolocateOptions(attitude="recorded"))
+    agree, total = numbers(said(found.warnings, "few-points-agree"))
+    assert agree < 30 and total == 60
+
+
 def test_limits_of_angle_and_sigma_thin_the_inliers() -> None:
     all_points, _, _ = located(Noise(), Measured())
     strict, _, _ = located(Noise(), Measured(), GeolocateOptions(max_sigma=0.4))
