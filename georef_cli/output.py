@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -15,7 +15,7 @@ from georef_cli import tables
 from georef_cli.evaluation import with_evaluation
 from georef_cli.layout import ByWidth, Safe, plain_table, shown
 from georef_cli.tables import Renderable
-from pipelines.core.products import dump_json
+from pipelines.core.products import Remark, dump_json
 from pipelines.core.runner import Outcome
 from pipelines.core.staleness import cautions_by_stage, document_of_cautions
 from pipelines.core.workspace import Workspace
@@ -179,14 +179,16 @@ def print_outcomes(
     result: Overview | None,
     solved: EvaluationReport | None = None,
     *,
+    cautions: Mapping[str, tuple[Remark, ...]] | None = None,
     as_json: bool,
     told: bool,
 ) -> None:
     """Print the results of several stages, the overview of the whole if there is one, and last the cautions.
 
-    `solved` is the evaluation of cameras without training. `told`: the log on the same terminal has shown the rest.
+    `solved` is the evaluation of cameras without training. `cautions` of stages stand beside those of the products.
+    `told`: the log on the same terminal has shown the rest.
     """
-    cautions = with_evaluation(cautions_by_stage(workspace), solved)
+    cautions = with_evaluation({**cautions_by_stage(workspace), **(cautions or {})}, solved)
     if as_json:
         stages = [document_of(outcome) for outcome in outcomes]
         document = {"workspace": str(workspace.root), "stages": stages, "result": result and result.feature()}

@@ -26,6 +26,7 @@ from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.ingest.options import IngestOptions
 from pipelines.jobs import pace
+from pipelines.survey.headline import outdated, with_newest_solution
 from pipelines.survey.options import AreaOptions, CrsOptions
 
 if TYPE_CHECKING:
@@ -106,9 +107,16 @@ def _run(ctx: click.Context, **values: Any) -> None:
             around=lambda spec: _counted(workspace, spec, done, left, trains=trains),
         )
     keep_times(estimate, outcomes, before)
-    solved = evaluated_cameras(workspace) if stages[-1].name == "init-sim3" else None
+    newest = with_newest_solution(workspace)
+    solved = evaluated_cameras(newest) if stages[-1].name == "init-sim3" else None
     print_outcomes(
-        workspace, outcomes, _overview(workspace), solved, as_json=values["as_json"], told=is_told(ctx.obj)
+        newest,
+        outcomes,
+        _overview(newest),
+        solved,
+        cautions=outdated(workspace, newest),
+        as_json=values["as_json"],
+        told=is_told(ctx.obj),
     )
 
 
@@ -133,7 +141,7 @@ def _counted(
 
 def _overview(workspace: Workspace) -> Overview | None:
     """Return the overview of what the run has reached; None before training."""
-    if not (workspace.root / MODEL).exists():
+    if not workspace.has(MODEL):
         return None
     from pipelines.deliver.overview import overview
 

@@ -12,13 +12,14 @@ from pipelines.core.options import notation
 from pipelines.core.plan import option_origins
 from pipelines.core.stages import BY_NAME
 from pipelines.core.workspace import Workspace
-from pipelines.survey.headline import headline_of
+from pipelines.survey.headline import headline_of, outdated, with_newest_solution
 
 
 def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:
-    rows, solved = states.status(workspace), evaluated_cameras(workspace, with_area=False)
-    cautions = with_evaluation(states.cautions_by_stage(workspace), solved)
-    accuracy = headline_of(workspace) if solved is None else solved.headline
+    rows, newest = states.status(workspace), with_newest_solution(workspace)
+    solved = evaluated_cameras(newest, with_area=False)
+    cautions = with_evaluation({**states.cautions_by_stage(newest), **outdated(workspace, newest)}, solved)
+    accuracy = headline_of(newest) if solved is None else solved.headline
     origins = [row for spec in BY_NAME.values() for row in option_origins(workspace, spec)] if with_options else []
     if not as_json:
         print_rich(tables.states(rows, cautions), *tables.accuracy_line(accuracy), *tables.cautions(cautions))

@@ -1,6 +1,7 @@
 """Cautions of the lens that SfM has found: its focal length against the tags, and rows that move with the flight.
 
-A focal length far from that of the photographs' tags belongs to a model that is bent, or to tags of another size.
+A focal length far from that of the photographs' tags belongs to a model that is bent, or to tags of another size;
+one that differs by a third is a question to what checks the survey.
 
 The bundle estimates the motion of the rows of each photograph (`geometry.row_motion`). A camera of velocity v along
 the axes of a photograph, whose rows are read within T seconds, shifts the last row by −F v T / (2 d) at depth d.
@@ -14,11 +15,11 @@ import numpy as np
 from pipelines.adjust.fix_patterns import CameraPath
 from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.types import FloatArray
+from pipelines.geometry.cameras import Camera
 from pipelines.geometry.row_motion import RowMotion
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.survey import Survey
+from pipelines.survey.survey import FOCAL_APART, FOCAL_DIFFERS, CameraPrior, Survey
 
-_MOST_FOCAL = 1.5  # tags of a crop, a rounded lens or a 35-mm equivalent are off by less
 _LEAST_IMAGES = 8
 _EXPLAINED = 0.6  # part of the motion's information that one readout time explains
 _STRAIGHT = np.cos(np.radians(30.0))  # of the way to a photograph with that from it
@@ -26,32 +27,48 @@ _LEAST_PX = 0.1  # typical motion of the last row that is worth a caution
 
 
 def focal_length_of(survey: Survey, model: SparseModel) -> tuple[Remark, ...]:
-    """Return the caution that a camera's focal length is far from the one that tags, or the user, state."""
-    stated = {camera.camera_id: camera for camera in survey.cameras if camera.focal_source != "assumed"}
+    """Return the cautions that a camera's focal length differs from the one that tags, or the user, state.
+
+    Up to `FOCAL_APART`, either may be wrong, and what checks the survey decides. Beyond, no accuracy is stated.
+    """
+    prior_of = {camera.camera_id: camera for camera in survey.cameras}
     camera_of = {image.name: image.camera_id for image in survey.images}
     found = {}
     for image, name in enumerate(model.image_name):
-        prior = stated.get(camera_of[name])
-        if prior is None:
-            continue
-        before, now = prior.camera.mean_focal_px, model.camera_of(image).mean_focal_px
-        if not 1 / _MOST_FOCAL < now / before < _MOST_FOCAL:
-            found[prior.make_model.strip() or f"camera {prior.camera_id}"] = (now, before, prior.focal_source)
-    apart = tuple(
-        Remark(
-            code="focal-length-apart",
-            sentence=f"SfM gives {camera} a focal length of {now:.0f} px, where "
-            f"{'its tags state' if source == 'exif' else 'the input states'} {before:.0f} px. "
-            "No lens is so far off: the SfM model is bent, most likely because too few photographs overlap, or the "
-            "tags belong to another size. Leave out photographs that connect to few others, add photographs, or "
-            "state the focal length with --focal-px.",
-        )
-        for camera, (now, before, source) in found.items()
-    )
+        prior, solved = prior_of[camera_of[name]], model.camera_of(image)
+        if prior.focal_factor(solved) > FOCAL_DIFFERS:
+            found[prior.make_model.strip() or f"camera {prior.camera_id}"] = prior, solved
+    cautions = tuple(_apart(camera, prior, solved) for camera, (prior, solved) in found.items())
     unchecked = Remark(
         code=NOT_CHECKED, sentence="No accuracy is stated: σ describe errors of a model, not a model that is bent."
     )
-    return (*apart, unchecked) if apart else ()
+    return (*cautions, unchecked) if any(one.code == _NO_LENS for one in cautions) else cautions
+
+
+_NO_LENS = "focal-length-apart"
+
+
+def _apart(camera: str, prior: CameraPrior, solved: Camera) -> Remark:
+    """Return the caution of one camera whose focal length is not the stated one."""
+    stated, share = prior.camera.mean_focal_px, solved.mean_focal_px / prior.camera.mean_focal_px - 1
+    by = "its tags state" if prior.focal_source == "exif" else "the input states"
+    sentence = (
+        f"SfM gives {camera} a focal length of {solved.mean_focal_px:.0f} px, where {by} {stated:.0f} px "
+        f"({100 * share:+.0f} %). "
+    )
+    if prior.focal_factor(solved) > FOCAL_APART:
+        return Remark(
+            code=_NO_LENS,
+            sentence=sentence + "No lens is so far off: the SfM model is bent, most likely because too few "
+            "photographs overlap, or the tags belong to another size. Leave out photographs that connect to few "
+            "others, add photographs, or state the focal length with --focal-px.",
+        )
+    return Remark(
+        code="focal-length-differs",
+        sentence=sentence + "Tags are rounded, or of a crop, and then the solved one is right; or the photographs "
+        "do not determine it, and then the ground may be wrong by as large a share of the flying height. Control "
+        "or check points tell which. --focal-px states a focal length that is known.",
+    )
 
 
 def rolling_shutter_of(

@@ -66,7 +66,7 @@ def fingerprints(
     markers = input_markers(type(options))
     try:
         for part in spec.reads:
-            result.hashes.update(_hash_part(workspace, part, memo))
+            result.hashes.update(hashes_of(workspace, part, memo))
         for name, path in input_paths(options).items():
             flag = flag_name(type(options), name)
             if not path.exists():
@@ -84,7 +84,7 @@ def fingerprints(
     return result
 
 
-def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str, str]:
+def hashes_of(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str, str]:
     """Return the hash of a part and of the products read with it; none for a missing or empty optional part."""
     try:
         path = workspace.path(part.product)
@@ -105,7 +105,7 @@ def _hash_part(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str,
     text = json.dumps(values, sort_keys=True)
     hashes = {part.product: hashlib.sha256(text.encode()).hexdigest()}
     for product in part.brings:
-        hashes |= _hash_part(workspace, ProductPart(product, optional=True), memo)
+        hashes |= hashes_of(workspace, ProductPart(product, optional=True), memo)
     return hashes
 
 

@@ -13,13 +13,22 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipelines.core.errors import InputError, MissingProductError
-from pipelines.core.fingerprints import Fingerprints, fingerprints
+from pipelines.core.fingerprints import Fingerprints, fingerprints, hashes_of
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo
 from pipelines.core.options import StageOptions, as_flags, decisive_fields, load_toml, read_requests, resolve
 from pipelines.core.products import Remark, union
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.stages import BY_NAME, CHANGE, DELIVERABLES, PIPELINE, StageSpec, producer_of, products_of
+from pipelines.core.stages import (
+    BY_NAME,
+    CHANGE,
+    DELIVERABLES,
+    PIPELINE,
+    StageSpec,
+    producer_of,
+    products_of,
+    whole_products,
+)
 from pipelines.core.validators import require_text
 from pipelines.core.workspace import Workspace
 
@@ -97,6 +106,20 @@ def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
         return changed
     gone = [product for product in products_of(asked.spec) if not (workspace.root / product).exists()]
     return f"{', '.join(gone)} is gone" if gone else ""
+
+
+def is_made_from(workspace: Workspace, spec: StageSpec, products: Sequence[str], memo: Memo) -> bool:
+    """Return whether a finished product was made from these whole products as they are, or without those missing.
+
+    A product without a manifest that can be read counts as made from them: nothing tells otherwise.
+    """
+    made = None if spec.folder in workspace.lent else _readable_manifest(workspace, spec)
+    if made is None:
+        return True
+    present: dict[str, str] = {}
+    for part in whole_products(*products, optional=True):
+        present.update(hashes_of(workspace, part, memo))
+    return all(present.get(product) == made.inputs.get(product) for product in products)
 
 
 def changed_options(options: StageOptions, config: Mapping[str, Any], but: Collection[str] = ()) -> str:

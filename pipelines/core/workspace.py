@@ -11,7 +11,7 @@ import contextlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -167,6 +167,7 @@ class Workspace:
         lent: for a variant, stage folders outside it, by name. The variant reads them and never writes them.
         command: for a variant, the command that makes its products.
         outside: for a workspace that cannot be written, the folder that takes all that a stage writes.
+        hidden: stage folders that are read as if they did not exist.
     """
 
     root: Path
@@ -174,18 +175,23 @@ class Workspace:
     lent: Mapping[str, Path] = field(default_factory=dict, hash=False)
     command: str = ""
     outside: Path | None = None
+    hidden: frozenset[str] = frozenset()
 
     def path(self, product: str) -> Path:
         """Return the path of a finished product; a MissingProductError names the command that makes it."""
         folder, _, inside = product.partition("/")
         path = self._folder(folder) / inside
-        if not path.exists():
+        if folder in self.hidden or not path.exists():
             raise MissingProductError(product, self.command_of(producer_of(product)))
         return path
 
     def has(self, product: str) -> bool:
         folder, _, inside = product.partition("/")
-        return (self._folder(folder) / inside).exists()
+        return folder not in self.hidden and (self._folder(folder) / inside).exists()
+
+    def without(self, *specs: StageSpec) -> Workspace:
+        """Return the workspace as if these stages had made nothing, to be read."""
+        return replace(self, hidden=self.hidden.union(spec.folder for spec in specs))
 
     def command_of(self, spec: StageSpec) -> str:
         home = (self.base or self).root
@@ -224,7 +230,7 @@ class Workspace:
     def manifest(self, spec: StageSpec) -> Manifest | None:
         """Return the manifest of a finished stage, or None; an InputError: it is damaged."""
         path = self._folder(spec.folder) / MANIFEST
-        return load_json(Manifest, path) if path.exists() else None
+        return load_json(Manifest, path) if path.exists() and spec.folder not in self.hidden else None
 
     def placed_by_hand(self, spec: StageSpec) -> bool:
         """Return whether all products of a stage exist without a manifest."""

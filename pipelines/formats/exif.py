@@ -52,6 +52,7 @@ class DjiTags:
     """Tags of a drone, by DJI's names or by those of other makers that mean the same; None if absent."""
 
     gimbal_yaw_pitch_roll_deg: Vector3 | None = None  # Z-Y-X from North-East-Down
+    mount_yaw_pitch_roll_deg: Vector3 | None = None  # of what a camera is mounted on that looks down, as PIX4D's
     rtk_flag: int | None = None  # 50 fixed, 34 float, 16 single point, 0 none
     rtk_sigma_enu_m: Vector3 | None = None
     absolute_altitude_m: float | None = None  # above the same reference as `GPSAltitude`
@@ -449,12 +450,15 @@ def _drone(xmp: Xmp) -> DjiTags:
         or _triple(xmp, [f"Camera{angle}Degree" for angle in turned])  # Parrot
         or _triple(xmp, turned, within="CameraOrientationNED")  # Skydio
     )
+    mount = _triple(xmp, turned, within="", namespace="pix4d.com/camera")
     flight_yaw = xmp.number("FlightYawDegree", "DroneYawDegree")
     if flight_yaw is None:
         flight_yaw = xmp.number("Yaw", within="VehicleOrientationNED")
     flag = xmp.number("RtkFlag")
     return DjiTags(
         gimbal_yaw_pitch_roll_deg=gimbal,
+        # Cameras without an attitude write zeros.
+        mount_yaw_pitch_roll_deg=mount if mount != (0.0, 0.0, 0.0) else None,
         rtk_flag=None if flag is None else int(flag),
         rtk_sigma_enu_m=sigma if sigma is not None and min(sigma) > 0.0 else None,
         absolute_altitude_m=_xmp_height(xmp),
@@ -465,8 +469,10 @@ def _drone(xmp: Xmp) -> DjiTags:
     )
 
 
-def _triple(xmp: Xmp, names: Sequence[str], within: str | None = None) -> Vector3 | None:
-    first, second, third = (xmp.number(name, within=within) for name in names)
+def _triple(
+    xmp: Xmp, names: Sequence[str], within: str | None = None, namespace: str | None = None
+) -> Vector3 | None:
+    first, second, third = (xmp.number(name, within=within, namespace=namespace) for name in names)
     if first is None or second is None or third is None:
         return None
     return (first, second, third)

@@ -13,6 +13,8 @@ from pipelines.core.types import FloatArray
 
 # Columns: the gimbal's forward, right and down axes seen from a camera (x right, y down, z forward).
 _CAM_FROM_GIMBAL: FloatArray = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+# A camera's right, down and forward axes seen from the aircraft (forward, right, down) below which it looks down.
+_MOUNT_FROM_CAM: FloatArray = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 # Photogrammetry's image axes (x right, y up, z backward) seen from a camera.
 _CAM_FROM_PHOTO = np.diag([1.0, -1.0, -1.0])
 # Also the attitude in East-North-Up of a body (forward, right, down) that is level and heads north.
@@ -86,6 +88,17 @@ def geo_from_cam(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
     angles = np.asarray(yaw_pitch_roll_deg, dtype=np.float64)
     turned = np.asarray(Rotation.from_euler("ZYX", angles.reshape(-1, 3), degrees=True).as_matrix())
     return np.asarray(ENU_FROM_NED @ turned.reshape(*angles.shape[:-1], 3, 3) @ _CAM_FROM_GIMBAL.T)
+
+
+def geo_from_mounted_cam(yaw_pitch_roll_deg: ArrayLike) -> FloatArray:
+    """Return rotations (…, 3, 3) camera → East-North-Up of the angles (…, 3) in degrees of what it is mounted on.
+
+    The angles turn North-East-Down into forward, right, down of an aircraft, in the order Z-Y-X. The camera looks
+    down, the upper edge of its image is forward: with pitch 90 it looks at the horizon (PIX4D's yaw, pitch, roll).
+    """
+    angles = np.asarray(yaw_pitch_roll_deg, dtype=np.float64)
+    turned = np.asarray(Rotation.from_euler("ZYX", angles.reshape(-1, 3), degrees=True).as_matrix())
+    return np.asarray(ENU_FROM_NED @ turned.reshape(*angles.shape[:-1], 3, 3) @ _MOUNT_FROM_CAM)
 
 
 def yaw_pitch_roll_deg(geo_from_cam_rotation: ArrayLike) -> FloatArray:

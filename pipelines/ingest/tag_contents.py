@@ -71,9 +71,9 @@ def contents(photos: Sequence[Photo]) -> str:
         )
         found.append(f"times of {len(times)} ({first} to {last})")
     drone = [photo.tags.dji for photo in photos if photo.tags.dji is not None]
-    attitudes = sum(tags.gimbal_yaw_pitch_roll_deg is not None for tags in drone)
+    attitudes = sum(bool(tags.gimbal_yaw_pitch_roll_deg or tags.mount_yaw_pitch_roll_deg) for tags in drone)
     if attitudes:
-        found.append(f"attitudes of the gimbal of {attitudes}")
+        found.append(f"attitudes of {attitudes}")
     heights = [tags.relative_altitude_m for tags in drone if tags.relative_altitude_m is not None]
     if heights:
         found.append(f"heights above take-off of {len(heights)} ({min(heights):.1f} to {max(heights):.1f} m)")

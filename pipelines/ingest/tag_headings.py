@@ -1,5 +1,8 @@
 """Attitudes of photographs by their tags, with headings compared: gimbal's and aircraft's yaw, EXIF's direction.
 
+A gimbal's pitch is −90° where it looks down. The tags that PIX4D has defined, of senseFly, Parrot, Sentera, Autel
+and others, describe what the camera is mounted on: their pitch is 0° where it looks down.
+
 A gimbal that integrates its own turning may be off by a constant of each start, with the aircraft's compass right
 beside it. At nadir both state the same angle. Where they differ, the flight's own motion decides: an aircraft that
 flies nose first has the yaw of its track. Else the aircraft's yaw counts with a σ that covers both.
@@ -11,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.geometry.rotations import geo_from_cam
+from pipelines.formats.exif import DjiTags
+from pipelines.geometry.rotations import geo_from_cam, geo_from_mounted_cam, log_so3
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
 
@@ -22,7 +26,8 @@ _LEAST = 3
 _START_GAP_S = 300.0
 _MOST_GAP_S = 30.0  # between photographs whose positions give a direction of flight
 _LEAST_STEP_M = 3.0
-_SIGMA_DEG = 5.0  # of a heading that the motion has corrected
+_SIGMA_DEG = 5.0  # of a heading that the motion has corrected, and of an attitude without a gimbal
+_BACKWARD_DEG = -45.0  # pitch of a mount below which its camera would look backward
 
 
 @dataclass(frozen=True)
@@ -47,30 +52,62 @@ def tagged_attitudes(
     photos: Sequence[Photo], lon_lat: FloatArray, time_s: FloatArray, remarks: Remarks
 ) -> TaggedAttitudes:
     """Return the attitudes that the tags of photographs state; `lon_lat` (N, 2) in degrees, with times (N,)."""
-    angles = np.full((len(photos), 3), np.nan)
-    aircraft = np.full(len(photos), np.nan)
+    tags = [photo.tags.dji or DjiTags() for photo in photos]
+    angles, mounted = _angles(tags, remarks)
     second = "the aircraft's yaw"
-    for row, photo in enumerate(photos):
-        if photo.tags.dji is not None:
-            if photo.tags.dji.gimbal_yaw_pitch_roll_deg is not None:
-                angles[row] = photo.tags.dji.gimbal_yaw_pitch_roll_deg
-            if photo.tags.dji.flight_yaw_deg is not None:
-                aircraft[row] = photo.tags.dji.flight_yaw_deg
+    aircraft = np.array([np.nan if one.flight_yaw_deg is None else one.flight_yaw_deg for one in tags])
     if not np.isfinite(aircraft).any():
         second = "EXIF's GPSImgDirection"
         directions = (photo.tags.direction_deg for photo in photos)
         aircraft = np.array([np.nan if one is None else one for one in directions])
     headings = _Headings(angles[:, 0], aircraft, _track(lon_lat, time_s), _starts(time_s))
-    sigma_deg, nadir = np.full(len(photos), np.nan), angles[:, 1] <= _NADIR_DEG
+    sigma_deg, nadir = np.full(len(photos), np.nan), _pitch_of_view(angles, mounted) <= _NADIR_DEG
     starts = [headings.start == number for number in np.unique(headings.start)]
     if any(_disagrees(headings, rows & nadir, _LEAST) for rows in starts):
         for rows in starts:
             if _disagrees(headings, rows & nadir, 1):
                 angles[rows, 0], sigma_deg[rows] = _of_start(headings, nadir, rows, second, remarks)
     enu_from_cam = np.full((len(photos), 3, 3), np.nan)
-    for row in np.flatnonzero(np.isfinite(angles).all(axis=1)).tolist():
-        enu_from_cam[row] = geo_from_cam(angles[row])
-    return TaggedAttitudes(enu_from_cam, sigma_deg)
+    known = np.isfinite(angles).all(axis=1)
+    enu_from_cam[known & ~mounted] = geo_from_cam(angles[known & ~mounted])
+    enu_from_cam[known & mounted] = geo_from_mounted_cam(angles[known & mounted])
+    return TaggedAttitudes(enu_from_cam, np.where(mounted & np.isnan(sigma_deg), _SIGMA_DEG, sigma_deg))
+
+
+def _angles(tags: Sequence[DjiTags], remarks: Remarks) -> tuple[FloatArray, BoolArray]:
+    """Return the yaw, pitch and roll (N, 3) that tags state, NaN without, and which are those of a mount (N,)."""
+    unknown = (np.nan, np.nan, np.nan)
+    gimbal = np.array([one.gimbal_yaw_pitch_roll_deg or unknown for one in tags]).reshape(-1, 3)
+    mount = np.array([one.mount_yaw_pitch_roll_deg or unknown for one in tags]).reshape(-1, 3)
+    stated, of_gimbal = np.isfinite(mount[:, 0]), np.isfinite(gimbal[:, 0])
+    if not stated.any():
+        return gimbal, stated
+    as_gimbal = float(np.median(mount[stated, 1])) < _BACKWARD_DEG
+    both = stated & of_gimbal
+    if both.any():
+        second = (geo_from_cam if as_gimbal else geo_from_mounted_cam)(mount[both])
+        apart = np.linalg.norm(log_so3(np.swapaxes(geo_from_cam(gimbal[both]), 1, 2) @ second), axis=1)
+        if (apart_deg := float(np.degrees(np.median(apart)))) > _APART_DEG:
+            remarks.caution(
+                "attitudes-apart",
+                f"XMP states two attitudes of {int(both.sum())} photographs, the gimbal's and one in PIX4D's tags, "
+                f"which differ by {apart_deg:.0f}°. The gimbal's are used.",
+            )
+    mounted = stated & ~of_gimbal
+    if as_gimbal and mounted.any():
+        remarks.assume(
+            "pitch-as-of-gimbal",
+            f"The pitch in PIX4D's tags of {int(mounted.sum())} photographs is {np.median(mount[stated, 1]):.0f}°, "
+            "with which a camera would look backward by PIX4D's definition (0° down, 90° ahead): it is taken as a "
+            "gimbal's, −90° down.",
+        )
+    return np.where(of_gimbal[:, None], gimbal, mount), mounted & (not as_gimbal)
+
+
+def _pitch_of_view(angles: FloatArray, mounted: BoolArray) -> FloatArray:
+    """Return the pitch (N,) in degrees of the viewing axis by angles (N, 3) of gimbals or of mounts; −90: down."""
+    up = np.cos(np.radians(angles[:, 1])) * np.cos(np.radians(angles[:, 2]))
+    return np.where(mounted, -np.degrees(np.arcsin(np.clip(up, -1.0, 1.0))), angles[:, 1])
 
 
 def _disagrees(headings: _Headings, rows: BoolArray, least: int) -> bool:
@@ -83,7 +120,7 @@ def _disagrees(headings: _Headings, rows: BoolArray, least: int) -> bool:
 def _of_start(
     headings: _Headings, nadir: BoolArray, rows: BoolArray, second: str, remarks: Remarks
 ) -> tuple[FloatArray, FloatArray]:
-    """Return headings and σ (n,) of the photographs of one start; NaN is the σ of an undisputed gimbal."""
+    """Return headings and σ (n,) of the photographs of one start; NaN where nothing speaks against it."""
     gimbal, aircraft, track = headings.gimbal[rows], headings.aircraft[rows], headings.track[rows]
     apart = _wrapped(gimbal - aircraft)
     tell = nadir[rows] & np.isfinite(apart)
@@ -106,13 +143,13 @@ def _of_start(
         )
         straight = tell & (np.abs(_wrapped(aircraft - track)) < _ALONG_DEG)
         corrected = gimbal - _middle(apart[straight])
-        return np.where(known, corrected, gimbal), np.where(known, _SIGMA_DEG, np.nan)
+        return np.where(known, corrected, gimbal), np.where(known, _SIGMA_DEG, undisputed)
     remarks.caution(
         "headings-apart",
         f"{says}, and the direction of flight does not tell which is right. {second.capitalize()} is used, with "
         "the difference as σ.",
     )
-    return np.where(known, aircraft, gimbal), np.where(known, np.maximum(np.abs(apart), _SIGMA_DEG), np.nan)
+    return np.where(known, aircraft, gimbal), np.where(known, np.maximum(np.abs(apart), _SIGMA_DEG), undisputed)
 
 
 def _track(lon_lat: FloatArray, time_s: FloatArray) -> FloatArray:

@@ -9,11 +9,8 @@ from typing import Any
 import numpy as np
 
 from pipelines.geometry.cameras import Camera, undistort
-from pipelines.survey.survey import Survey
+from pipelines.survey.survey import FOCAL_DIFFERS, Survey
 
-# A stated focal length is rounded, from a nominal sensor, or the 35 mm equivalent of another crop: real ones differ
-# from the solved by up to a tenth.
-_FURTHEST_FOCAL = 0.15
 _RIM = 0.98  # of the image's half sides: at the corners themselves few points lie
 
 
@@ -25,9 +22,11 @@ def lenses_astray(model: Any, survey: Survey) -> dict[int, str]:
     for camera_id in sorted(used & set(priors)):
         solved, prior = model.cameras[camera_id], priors[camera_id]
         lens = Camera(solved.model_name, int(solved.width), int(solved.height), np.array(solved.params))
-        focal_px, stated_px = lens.mean_focal_px, prior.camera.mean_focal_px
-        if prior.focal_source != "assumed" and abs(focal_px / stated_px - 1) > _FURTHEST_FOCAL:
-            astray[camera_id] = f"a focal length of {focal_px:.0f} px, where {stated_px:.0f} px are stated"
+        if prior.focal_factor(lens) > FOCAL_DIFFERS:
+            stated_px = prior.camera.mean_focal_px
+            astray[camera_id] = (
+                f"a focal length of {lens.mean_focal_px:.0f} px, where {stated_px:.0f} px are stated"
+            )
         elif not _sees_its_rim(lens):
             astray[camera_id] = "a distortion that turns rays back within the image"
     return astray

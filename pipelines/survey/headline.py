@@ -9,8 +9,11 @@ from typing import Literal
 
 from pipelines.core.errors import GeorefError
 from pipelines.core.figures import Headline, SurfaceAccuracy
+from pipelines.core.manifest import Memo
 from pipelines.core.products import Remark, is_checked
-from pipelines.core.stages import REPORT
+from pipelines.core.sentences import listed
+from pipelines.core.stages import ADJUSTMENT, BY_NAME, MODEL, PIPELINE, REPORT, SIM3, SPARSE
+from pipelines.core.staleness import is_made_from
 from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.vertical import MOST_GEOID_M
@@ -71,11 +74,47 @@ def predicted(scene: AccuracySummary, cautions: tuple[Remark, ...]) -> Headline:
 def headline_of(workspace: Workspace) -> Headline | None:
     """Return the accuracy of a workspace: that of its evaluation, else the predicted one; None: neither exists.
 
-    A damaged report states none; `georef status` names it.
+    An evaluation of an earlier solution states none. Nor does a damaged report; `georef status` names it.
     """
-    with contextlib.suppress(GeorefError):
-        return read_report(workspace.path(REPORT)).headline
+    if is_evaluated(workspace):
+        with contextlib.suppress(GeorefError):
+            return read_report(workspace.path(REPORT)).headline
     return predicted_headline(workspace)
+
+
+def is_evaluated(workspace: Workspace) -> bool:
+    """Return whether there is an evaluation of the solution that `load_solution` returns."""
+    solution = (MODEL,) if workspace.has(MODEL) else (SIM3, ADJUSTMENT, MODEL)
+    return workspace.has(REPORT) and is_made_from(workspace, BY_NAME["evaluate"], solution, {})
+
+
+def with_newest_solution(workspace: Workspace) -> Workspace:
+    """Return the workspace as if what a newer SfM model or `init-sim3` has outdated did not exist.
+
+    That are a solution or a training of another SfM model, a training of another `init-sim3`, and the evaluation of
+    another solution.
+    """
+    memo: Memo = {}
+    for stage, made_from in {"init-sim3": (SPARSE,), "train": (SPARSE, SIM3, ADJUSTMENT)}.items():
+        if not is_made_from(workspace, BY_NAME[stage], made_from, memo):
+            workspace = workspace.without(BY_NAME[stage])
+    return workspace if is_evaluated(workspace) else workspace.without(BY_NAME["evaluate"])
+
+
+def outdated(workspace: Workspace, newest: Workspace) -> dict[str, tuple[Remark, ...]]:
+    """Return the caution that a workspace has more than its `newest` solution, under the first of the others."""
+    hidden = [spec for spec in PIPELINE if spec.folder in newest.hidden and workspace.has(spec.product)]
+    if not hidden:
+        return {}
+    names = listed([spec.name for spec in hidden])
+    many = len(hidden) > 1
+    caution = Remark(
+        code="result-of-earlier-solution",
+        sentence=f"{names} {'are' if many else 'is'} stale: an earlier stage has a newer result. "
+        f"The accuracy stated here is not that of {'them' if many else 'it'}. "
+        f"`georef run {(workspace.base or workspace).root}` makes {'them' if many else 'it'} again.",
+    )
+    return {hidden[0].name: (caution,)}
 
 
 def predicted_headline(workspace: Workspace) -> Headline | None:

@@ -143,6 +143,11 @@ class RigCalibration(Product):
 _NotNegative = Annotated[float, Field(ge=0)]
 
 
+# A stated focal length is rounded, from a nominal sensor, or the 35 mm equivalent of another crop: real ones differ
+# from the solved by up to a tenth. Beyond the second factor no tag of the same lens is.
+FOCAL_DIFFERS, FOCAL_APART = 1.15, 1.5
+
+
 class CameraPrior(Product):
     """Intrinsics of a camera before SfM: COLMAP's model and parameters, in pixels of the full image.
 
@@ -164,6 +169,16 @@ class CameraPrior(Product):
     def camera(self) -> Camera:
         """Return the camera that these intrinsics describe."""
         return Camera(self.model, self.width, self.height, np.array(self.params))
+
+    def focal_factor(self, solved: Camera) -> float:
+        """Return the factor, 1 or more, between the focal length of a solved camera and the stated one.
+
+        1 where none is stated: an assumed one contradicts nothing. `FOCAL_DIFFERS` and `FOCAL_APART` judge it.
+        """
+        if self.focal_source == "assumed":
+            return 1.0
+        ratio = solved.mean_focal_px / self.camera.mean_focal_px
+        return max(ratio, 1 / ratio)
 
 
 class Fix(Product):

@@ -94,12 +94,25 @@ def test_rows_that_move_enlarge_the_covariance_of_the_poses() -> None:
     assert np.trace(moved.sums.poses.toarray()) < np.trace(clean.sums.poses.toarray())
 
 
+DIFFERS, APART = ["focal-length-differs"], ["focal-length-apart", "not-checked"]
+
+
 @pytest.mark.parametrize(
-    ("source", "factor", "is_said"),
-    [("exif", 1.8, True), ("option", 0.5, True), ("exif", 1.3, False), ("assumed", 1.8, False)],
+    ("source", "factor", "codes"),
+    [
+        ("exif", 1.8, APART),
+        ("option", 0.5, APART),
+        ("exif", 1.3, DIFFERS),
+        ("exif", 1 / 1.29, DIFFERS),
+        ("calibrated", 0.8, DIFFERS),
+        ("exif", 1.1, []),  # as rounded as a focal length in millimetres is
+        ("exif", 0.9, []),
+        ("assumed", 1.3, []),
+        ("assumed", 1.8, []),
+    ],
 )
-def test_a_focal_length_far_from_its_tags_is_said(source: str, factor: float, *, is_said: bool) -> None:
-    """A crop or a rounded equivalent is a third off; half or twice is another lens, or a model that is bent."""
+def test_a_focal_length_far_from_its_tags_is_said(source: str, factor: float, codes: list[str]) -> None:
+    """A crop or another equivalent is a third off; half or twice is another lens, or a model that is bent."""
     model = model_of("none")
     survey = survey_of(block(turns=False), Noise(), WITH_GCPS, np.random.default_rng(0))
     (prior,) = survey.cameras
@@ -107,5 +120,8 @@ def test_a_focal_length_far_from_its_tags_is_said(source: str, factor: float, *,
     tags = {"model": "SIMPLE_PINHOLE", "params": params, "focal_source": source}
     survey = survey.model_copy(update={"cameras": (prior.model_copy(update=tags),)})
     found = focal_length_of(survey, model)
-    assert [remark.code for remark in found] == ["focal-length-apart", "not-checked"] * is_said
-    assert all(f"{params[0]:.0f} px" in remark.sentence for remark in found[:1])
+    assert [remark.code for remark in found] == codes
+    solved_px = model.camera_of(0).mean_focal_px
+    for remark in found[:1]:
+        assert f"{params[0]:.0f} px" in remark.sentence and f"{solved_px:.0f} px" in remark.sentence
+        assert f"{100 * (solved_px / params[0] - 1):+.0f} %" in remark.sentence

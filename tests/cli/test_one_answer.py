@@ -5,7 +5,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,16 +17,29 @@ import pytest
 from georef_cli import job_tables
 from georef_cli.output import print_outcomes, print_rich
 from pipelines.core.figures import Headline
-from pipelines.core.fingerprints import fingerprints
+from pipelines.core.fingerprints import fingerprints, hashes_of
+from pipelines.core.manifest import MANIFEST, Manifest
 from pipelines.core.products import NOT_CHECKED, Remark, load_json, save_json
-from pipelines.core.stages import BY_NAME, DELIVERABLES, HEADLINE, PIPELINE, REPORT
+from pipelines.core.stages import (
+    ADJUSTMENT,
+    BY_NAME,
+    DELIVERABLES,
+    GAUSSIANS,
+    HEADLINE,
+    MODEL,
+    PIPELINE,
+    REPORT,
+    SPARSE,
+    TRAIN_POSTERIOR,
+)
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver import cameras, ply, spz, tiles
 from pipelines.deliver.overview import overview
+from pipelines.formats.colmap import write_sparse
 from pipelines.jobs.batch import BatchTable, mission_row, write_batch
 from pipelines.jobs.missions import Mission
 from pipelines.report import stage as report
-from pipelines.survey.headline import headline, headline_of
+from pipelines.survey.headline import headline, headline_of, with_newest_solution
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.report import AccuracySummary, EvaluationReport, TotalRmse, read_report
 from pipelines.survey.survey import Survey
@@ -207,3 +224,87 @@ def test_a_wrong_check_point_is_named_by_run_and_status_alike(real_georef: Geore
     assert "prediction-rejected" not in {one["code"] for one in document["cautions"]}
     status = real_georef("status", root, "--json").document
     assert status["accuracy"] == headline_ and caution in status["cautions"]
+
+
+def solved_again(real_georef: Georef, root: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the documents of a run to `init-sim3` without control points, and of the status after it."""
+    run = real_georef(
+        "run", root, "--to", "init-sim3", "--set", "init-sim3.control_points=false", "--json"
+    ).document
+    return run, real_georef("status", root, "--json").document
+
+
+def codes(document: dict[str, Any]) -> list[str]:
+    return [one["code"] for one in document["cautions"]]
+
+
+def test_a_new_solution_has_not_the_accuracy_of_the_evaluated_one(real_georef: Georef, tmp_path: Path) -> None:
+    scene, rng = make_scene(), np.random.default_rng(4)
+    noise = Noise(fix_m=(0.3, 0.3, 0.3), bias_m=(1.0, 0.0, 0.0))
+    survey = survey_of(scene, noise, WITH_GCPS, rng)
+    points = {"control_points": survey.control_points[2:], "check_points": survey.control_points[:2]}
+    root = write_workspace(tmp_path / "ws", survey.model_copy(update=points), sparse_model(scene, noise, rng)).root
+    assert real_georef("run", root, "--to", "init-sim3").code == 0
+    assert real_georef("evaluate", root).code == 0
+    before = real_georef("status", root, "--json").document
+    evaluated = read_report(root / REPORT).headline
+    assert before["accuracy"] == evaluated.model_dump(mode="json")
+    assert "result-of-earlier-solution" not in codes(before)
+
+    run, status = solved_again(real_georef, root)
+    stated = run["evaluation"]["headline"]
+    # The fixes alone are shifted by 1 m, which control points of centimetres removed.
+    assert stated["kind"] == "measured" and stated["rmse_h_m"] > 0.7
+    assert evaluated.rmse_h_m is not None and evaluated.rmse_h_m < 0.1
+    assert status["accuracy"] == stated
+    assert codes(run).count("result-of-earlier-solution") == codes(status).count("result-of-earlier-solution") == 1
+    text = " ".join(real_georef("status", root).out.split())
+    assert f"accuracy {Headline.model_validate(stated).text} caution" in text
+    # What is handed over of the new solution has its accuracy, by σ until it is evaluated.
+    handed_over = headline_of(Workspace(root))
+    assert handed_over is not None and handed_over.kind == "predicted"
+    assert real_georef("evaluate", root).code == 0
+    after = real_georef("status", root, "--json").document
+    assert after["accuracy"] == stated and "result-of-earlier-solution" not in codes(after)
+
+    # A newer SfM model makes the solution one of an earlier model, and nothing is known of the new one.
+    write_sparse(sparse_model(scene, noise, rng), root / SPARSE)
+    status = real_georef("status", root, "--json").document
+    assert status["accuracy"] is None and "result-of-earlier-solution" in codes(status)
+
+
+@pytest.mark.parametrize("newer", ["init-sim3", "train"])
+def test_a_training_of_an_earlier_solution_does_not_speak_for_the_new(
+    real_georef: Georef, flight: Workspace, newer: str
+) -> None:
+    """The evaluation is of the training; then `init-sim3` runs again, or the training does."""
+    stated = headline_of(flight)
+    model = (flight.root / MODEL).read_bytes()
+    posterior = (flight.root / TRAIN_POSTERIOR).read_bytes()
+    gaussians = (flight.root / GAUSSIANS).read_bytes()
+    untrained(flight)
+    (flight.root / "train").mkdir()
+    for product, content in {MODEL: model, TRAIN_POSTERIOR: posterior, GAUSSIANS: gaussians}.items():
+        (flight.root / product).write_bytes(content)
+    for name in ("train", "evaluate"):
+        spec = BY_NAME[name]
+        made = {"stage": name, "config": {}, "versions": {}, "key_figure": "", "values": {}, "warnings": []}
+        reads = (replace(part, optional=True) for part in spec.reads)  # `geolocate` has made nothing
+        inputs = dict(chain.from_iterable(hashes_of(flight, part, {}).items() for part in reads))
+        manifest = Manifest(started=datetime.now(UTC), duration_s=1.0, inputs=inputs, **made)
+        save_json(manifest, flight.root / spec.folder / MANIFEST)
+    assert headline_of(flight) == headline_of(with_newest_solution(flight)) == stated
+
+    changed = flight.root / (ADJUSTMENT if newer == "init-sim3" else MODEL)
+    solution = json.loads(changed.read_text("utf-8"))
+    solution["accuracy"] |= {"rms_sigma_h_m": 0.5, "rms_sigma_v_m": 0.25}
+    changed.write_text(json.dumps(solution), "utf-8")
+    status = real_georef("status", flight.root, "--json").document
+    (caution,) = (one for one in status["cautions"] if one["code"] == "result-of-earlier-solution")
+    if newer == "train":  # no evaluation of a newer training: σ predict its accuracy
+        assert caution["stage"] == "evaluate"
+        assert (status["accuracy"]["kind"], status["accuracy"]["rmse_h_m"]) == ("predicted", 0.5)
+        assert headline_of(flight) == Headline.model_validate(status["accuracy"])
+    else:  # the solution of init-sim3 is measured anew; the files of the training keep the accuracy of the training
+        assert caution["stage"] == "train" and "evaluate" in caution["sentence"]
+        assert status["accuracy"] != stated.model_dump(mode="json") and headline_of(flight) == stated

@@ -18,6 +18,7 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.survey_assembly import fix_sessions, require_placed
+from tests.formats.test_xmp import packet
 from tests.photos import ASCII, BYTE, RATIONAL, SHORT, Entry, Exif, dji_xmp, gps_entries, jpeg
 from tests.refusals import codes, numbers, refused, said
 
@@ -255,6 +256,83 @@ def test_where_the_track_tells_nothing_sigma_covers_both() -> None:
 def test_an_aircraft_beside_the_track_leaves_the_gimbal_right() -> None:
     poses, remarks = read(photos(gps=gps(*LINES), dji=headings(TRACK, TRACK + 70.0)))
     assert np.isnan(poses.sigma_attitude_deg).all() and codes(remarks.cautions) == ["headings-apart"]
+
+
+def pix4d_xmp(yaw: float, pitch: str = "4.2", roll: str = "-1.5", others: str = "") -> bytes:
+    names = "".join(
+        f"<Camera:{name}>{value}</Camera:{name}>"
+        for name, value in (("Yaw", yaw), ("Pitch", pitch), ("Roll", roll), ("GPSXYAccuracy", "2.3"))
+    )
+    space = 'xmlns:Camera="http://pix4d.com/camera/1.0/" xmlns:DLS="http://micasense.com/DLS/1.0/"'
+    return packet(f'<rdf:Description rdf:about="" {space}>{names}{others}</rdf:Description>')
+
+
+def of_packets(packets: list[bytes]) -> list[DjiTags]:
+    found = [read_tags(jpeg(xmp=one)).dji for one in packets]
+    return [one for one in found if one is not None]
+
+
+def test_attitudes_in_pix4d_tags_look_down_at_pitch_zero() -> None:
+    """As of a Sequoia on a fixed wing, its nose 4° up and turned into the wind: the camera looks ahead."""
+    crab = TRACK - 25.0 * np.cos(np.radians(TRACK))
+    poses, remarks = read(photos(gps=gps(*LINES), dji=of_packets([pix4d_xmp(yaw) for yaw in crab])))
+    view, top = poses.enu_from_cam[:, :, 2], -poses.enu_from_cam[:, :, 1]
+    heading = np.degrees(np.arctan2(top[:, 0], top[:, 1]))
+    assert np.abs((heading - crab + 180) % 360 - 180).max() < 0.2
+    np.testing.assert_allclose(view[:, 2], -np.cos(np.radians(4.2)) * np.cos(np.radians(1.5)), atol=1e-9)
+    forward = np.column_stack([np.sin(np.radians(crab)), np.cos(np.radians(crab))])
+    np.testing.assert_allclose((view[:, :2] * forward).sum(axis=1), np.sin(np.radians(4.2)), atol=1e-3)
+    # The left wing down (roll −1.5°) turns the view to the right.
+    right = np.column_stack([np.cos(np.radians(crab)), -np.sin(np.radians(crab))])
+    np.testing.assert_allclose((view[:, :2] * right).sum(axis=1), np.sin(np.radians(1.5)), atol=1e-3)
+    np.testing.assert_allclose(poses.sigma_attitude_deg, 5.0)
+    assert codes(remarks.cautions) == []
+    assert "pitch-as-of-gimbal" not in codes(remarks.assumptions)
+
+
+@pytest.mark.parametrize(
+    ("pitch", "roll", "view", "code"),
+    [
+        ("66.04", "0", (0.0, np.sin(np.radians(66.04)), -np.cos(np.radians(66.04))), None),  # ahead: Autel
+        ("-90", "0", (0.0, 0.0, -1.0), "pitch-as-of-gimbal"),  # a gimbal's angles in these tags
+        ("0/100", "0/100", None, None),  # as cameras without an attitude write
+    ],
+)
+def test_pitches_in_pix4d_tags(pitch: str, roll: str, view: tuple[float, ...] | None, code: str | None) -> None:
+    poses, remarks = read(photos(gps=gps(*LINES), dji=of_packets([pix4d_xmp(0.0, pitch, roll)] * 8)))
+    if view is None:
+        assert np.isnan(poses.enu_from_cam).all()
+    else:
+        np.testing.assert_allclose(poses.enu_from_cam[0, :, 2], view, atol=1e-9)
+    assert ("pitch-as-of-gimbal" in codes(remarks.assumptions)) == (code is not None)
+
+
+def test_a_sensor_of_light_has_no_attitude_of_the_camera() -> None:
+    """MicaSense states the attitude of its sun sensor in a namespace of its own, in radians."""
+    others = "<DLS:Yaw>1.57</DLS:Yaw><DLS:Pitch>0.05</DLS:Pitch><DLS:Roll>0.01</DLS:Roll>"
+    packets = [pix4d_xmp(0.0, "0", "0", others)] * 8
+    assert all(one.mount_yaw_pitch_roll_deg is None for one in of_packets(packets))
+
+
+@pytest.mark.parametrize(("yaw", "is_said"), [(4.0, False), (60.0, True)])
+def test_two_attitudes_in_xmp_are_compared(yaw: float, *, is_said: bool) -> None:
+    drone = [
+        replace(one, gimbal_yaw_pitch_roll_deg=(0.0, -90.0, 0.0)) for one in of_packets([pix4d_xmp(yaw, "0")] * 8)
+    ]
+    poses, remarks = read(photos(gps=gps(*LINES), dji=drone))
+    np.testing.assert_allclose(poses.enu_from_cam[0], geo_from_cam((0.0, -90.0, 0.0)), atol=1e-9)
+    assert codes(remarks.cautions) == ["attitudes-apart"] * is_said
+
+
+def test_an_attitude_in_pix4d_tags_beside_the_track_is_corrected_by_the_aircraft() -> None:
+    drone = [
+        replace(one, flight_yaw_deg=float(yaw))
+        for one, yaw in zip(of_packets([pix4d_xmp(yaw + 90.0, "0", "0.1") for yaw in TRACK]), TRACK, strict=True)
+    ]
+    poses, remarks = read(photos(gps=gps(*LINES), dji=drone))
+    top = -poses.enu_from_cam[:, :, 1]
+    assert np.abs((np.degrees(np.arctan2(top[:, 0], top[:, 1])) - TRACK + 180) % 360 - 180).max() < 0.1
+    assert codes(remarks.cautions) == ["headings-apart"]
 
 
 @pytest.mark.parametrize(("offset", "pitch"), [(9.0, -90.0), (90.0, -30.0)])
