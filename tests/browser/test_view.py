@@ -492,7 +492,9 @@ def test_results_are_above_the_fold_of_a_phone(server: ViewerServer, browser: Br
         view.done()
         row = page.locator('[data-quantity="distance"]')
         box = row.bounding_box()
-        assert box is not None and box["y"] >= 0 and box["y"] + box["height"] <= 760 and box["x"] + box["width"] <= 390
+        assert (
+            box is not None and box["y"] >= 0 and box["y"] + box["height"] <= 760 and box["x"] + box["width"] <= 390
+        )
         hit = "([x, y]) => document.elementFromPoint(x, y)?.closest('[data-quantity]') !== null"
         assert page.evaluate(hit, [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])  # nothing over it
         assert page.evaluate("() => document.querySelector('#panel').scrollTop") == 0
