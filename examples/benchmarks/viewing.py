@@ -1,14 +1,16 @@
 """Time the viewer of a large model: python examples/benchmarks/viewing.py WORKSPACE.
 
 The workspace is copied, and its Gaussians are split into many small ones that show the same scene. Then: the time
-from the start until a page in headless Chromium shows its first picture, and, without the page, of pictures,
-clicks, and the volume over 1 000 m² in the middle of the scene. Needs Chromium and the extra `dev`.
+from the start until a page in headless Chromium shows its first picture; pictures a second while the mouse turns
+the whole scene, with the coarser models of motion and with the trained model alone; and, without the page, the time
+of pictures, clicks, and the volume over 1 000 m² in the middle of the scene. Needs Chromium and the extra `dev`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import tempfile
 import time
@@ -17,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Page, sync_playwright
 
 from pipelines.core.stages import GAUSSIANS, MODEL, STAGES
 from pipelines.core.workspace import Workspace
@@ -25,6 +27,7 @@ from pipelines.report.chromium import chromium_path
 from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.surface.picking import Sight, SurfacePoint
 from pipelines.view.measuring import ESTIMATE, Fineness, WantedBase
+from pipelines.view.motion import MotionModels
 from pipelines.view.options import ViewOptions
 from pipelines.view.pictures import ViewerCamera, ViewFrame, Wanted
 from pipelines.view.server import served
@@ -55,6 +58,43 @@ def pages_camera(frame: ViewFrame) -> ViewerCamera:
     forward = np.array([0.0, np.cos(pitch), -np.sin(pitch)])
     rotation = np.stack([[1.0, 0.0, 0.0], np.cross(forward, [1.0, 0.0, 0.0]), forward])
     return ViewerCamera(rotation, -1.7 * frame.radius_m * forward, 0.9, _SIZE["width"], _SIZE["height"])
+
+
+_COUNTED = """() => {
+    window.widths = [];
+    const drawImage = CanvasRenderingContext2D.prototype.drawImage;
+    CanvasRenderingContext2D.prototype.drawImage = function (...given) {
+        if (this.canvas.id === "picture") widths.push(this.canvas.width);
+        return drawImage.apply(this, given);
+    };
+}"""
+
+
+def time_motion(page: Page, viewer: Viewer, seconds: float) -> None:
+    """Print how many pictures a second a page shows of the whole scene while the mouse turns it."""
+    viewer._sorting.join()
+    page.keyboard.press("h")
+    page.evaluate(_COUNTED)
+    made = viewer._painter._motion
+    assert made is not None
+    for name, motion in (("coarser models", made), ("trained model alone", MotionModels(made._models[0]))):
+        viewer._painter._motion = motion
+        page.mouse.move(600, 400)
+        page.mouse.down()
+        for lasts in (3.0, seconds):  # the first adapts the size of the pictures
+            began, step = time.perf_counter(), 0
+            page.evaluate("() => { widths.length = 0; }")
+            while time.perf_counter() - began < lasts:
+                page.mouse.move(600 + 120 * np.sin(step / 20), 400 + 20 * np.cos(step / 20))
+                step += 1
+                time.sleep(0.02)
+        page.mouse.up()
+        widths = page.evaluate("widths")
+        taken = time.perf_counter() - began
+        wide = f"{np.median(widths):.0f} pixels wide" if widths else "none"
+        print(f"moving, {name}: {len(widths) / taken:.1f} pictures/s, {wide}; load {os.getloadavg()[0]:.1f}")
+        page.wait_for_selector("body[data-drawn=full]", timeout=120_000)
+    viewer._painter._motion = made
 
 
 def time_answers(viewer: Viewer, clicks: int) -> None:
@@ -92,6 +132,7 @@ def main() -> None:
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--gaussians", type=int, default=1_000_000)
     parser.add_argument("--clicks", type=int, default=30)
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each motion")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as place, sync_playwright() as driver:
         copy = Path(place) / "large"
@@ -115,6 +156,7 @@ def main() -> None:
             page.goto(server.address)
             page.wait_for_selector("body[data-drawn]", timeout=120_000)
             print(f"first picture in the page after {time.perf_counter() - began:.1f} s")
+            time_motion(page, server.viewer, args.seconds)
             browser.close()
             time_answers(server.viewer, args.clicks)
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.files import replace_text
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.formats.tables import table_text
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.sparse_model import SparseModel
@@ -87,6 +87,12 @@ class AccuracyGrid:
         distance, cell = cKDTree(self.position_in_geo[:, :2]).query(position_in_geo[:, :2], k=[*range(1, near + 1)])
         weight = 1.0 / np.maximum(distance, _NEAR * self.size_m)
         return np.asarray(np.einsum("nk,nkij->nij", weight / weight.sum(axis=1, keepdims=True), self.cov_m2[cell]))
+
+    def covers(self, position_in_geo: FloatArray) -> BoolArray:
+        """Return which of the points (N, 3) lie in the scene; beyond it, σ is not known."""
+        distance, _ = cKDTree(self.position_in_geo[:, :2]).query(position_in_geo[:, :2])
+        within: BoolArray = distance <= _FARTHEST_CELLS * self.size_m
+        return within
 
     def summary(self) -> AccuracySummary:
         horizontal, vertical = self.sigma_h_m, self.sigma_v_m

@@ -200,6 +200,22 @@ def best_cut(root: DetailTile, most: int) -> list[DetailTile]:
         shown += coarsest.children
 
 
+def coarser(splat: SplatArrays, most: int) -> Iterator[SplatArrays]:
+    """Yield ever coarser splats of the whole scene, of at most half as many Gaussians each, the last of `most`.
+
+    Cells have one size in all of the scene. A splat of at most so many has none.
+    """
+    if len(splat) <= most:
+        return
+    codes, edge_m = _codes(splat.means)
+    order = np.argsort(codes, kind="stable")
+    curve, level = _Curve(mixture_of(rows_of(splat, order)), codes[order], edge_m), 0
+    while len(curve.codes) > most:
+        level = curve.level_of(curve.cell_m(level), max(len(curve.codes) // _LEAST_REDUCTION, 1))
+        curve = curve.merged(level)
+        yield drawn(curve.mixture, curve.cell_m(level))
+
+
 def scene_box(centers: ArrayLike) -> FloatArray:
     """Return the box (2, 3), least and largest coordinates, of a scene of Gaussians with these centres (N, 3)."""
     return np.asarray(np.quantile(np.asarray(centers), _INNER, axis=0))

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
@@ -77,6 +77,17 @@ class SpatialBlocks:
         """Return few Gaussians, in their order: all that a render of the whole image, or of the settings' window,
         can show.
         """
+        blocks = self._blocks_in(cam_from_model, camera, settings)
+        chosen = blocks[:, None] * _BLOCK + np.arange(_BLOCK)
+        rows = np.sort(self._row[chosen[chosen < self._count]])
+        # By numpy: torch would wake all its threads for a few thousand rows.
+        return Gaussians(**{name: torch.from_numpy(values[rows]) for name, values in self._values.items()})
+
+    def count_shown(self, cam_from_model: FloatArray, camera: Pinhole, settings: RasterSettings) -> int:
+        """Return how many Gaussians `shown` returns, but for the last block's, without gathering them."""
+        return min(len(self._blocks_in(cam_from_model, camera, settings)) * _BLOCK, self._count)
+
+    def _blocks_in(self, cam_from_model: FloatArray, camera: Pinhole, settings: RasterSettings) -> IntArray:
         image = settings.image_of(camera)
         x, y, z = (self._center @ cam_from_model[:3, :3].T + cam_from_model[:3, 3]).T
         ahead = z + self._radius >= settings.near_m
@@ -91,10 +102,7 @@ class SpatialBlocks:
             own = stretch * self._reach + margin * np.maximum(z + self._radius, 0.0)
             ahead &= across - high * z <= math.hypot(1.0, high) * self._radius + own
             ahead &= across - low * z >= -math.hypot(1.0, low) * self._radius - own
-        chosen = np.flatnonzero(ahead)[:, None] * _BLOCK + np.arange(_BLOCK)
-        rows = np.sort(self._row[chosen[chosen < self._count]])
-        # By numpy: torch would wake all its threads for a few thousand rows.
-        return Gaussians(**{name: torch.from_numpy(values[rows]) for name, values in self._values.items()})
+        return np.flatnonzero(ahead)
 
 
 def _order(means: Tensor, reach: Tensor) -> Tensor:

@@ -30,6 +30,7 @@ from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.area import photographs_that_see
 from pipelines.survey.photographs import decoded_photograph
 from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey
+from pipelines.view.motion import MotionModels
 
 Colouring = Literal["photographs", "height", "sigma", "views"]
 Box = tuple[float, float, float, float, float, float]  # west, south, low, east, north, high
@@ -136,6 +137,7 @@ class Wanted:
         share: of the photograph, 0 … 1.
         background: (3,) colour 0 … 1 where there is no Gaussian.
         box: of which the Gaussians are shown, in the viewer's frame; None: all.
+        moving: the picture is one of many, and may be coarse.
     """
 
     photograph: int | None = None
@@ -143,6 +145,7 @@ class Wanted:
     colouring: Colouring = "photographs"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     box: Box | None = None
+    moving: bool = False
 
 
 @dataclass(frozen=True)
@@ -170,8 +173,16 @@ class Painter:
         grid: AccuracyGrid | None,
     ) -> None:
         self._trained, self._photographs, self._frame, self._grid = trained, photographs, frame, grid
+        self._renderer_of_survey = renderer_of
         self._renderer_of = lru_cache(2)(lambda box, faded: renderer_of(self._clipped(box, faded)))
         self._making = threading.Lock()
+        self._motion: MotionModels | None = None
+
+    def prepare_motion(self, ended: threading.Event) -> None:
+        """Make the coarser models of the whole scene for pictures that move; `ended` gives up."""
+        with self._making:
+            self._motion = MotionModels(self._renderer_of(None, True))
+        self._motion.make(self._renderer_of_survey, ended)
 
     def paint(self, camera: ViewerCamera, wanted: Wanted) -> PageView:
         """Return the picture of a page's camera; a photograph over it shows only from its own place.
@@ -180,9 +191,13 @@ class Painter:
             InputError: the photograph cannot be read.
         """
         pose = self._frame.pose(camera)
-        with self._making:
-            renderer = self._renderer_of(wanted.box, wanted.photograph is None and wanted.box is None)
-        render = renderer.render(pose, depth=True)
+        whole = wanted.photograph is None and wanted.box is None
+        if wanted.moving and whole and self._motion is not None:
+            render = self._motion.render(pose)
+        else:
+            with self._making:
+                renderer = self._renderer_of(wanted.box, whole)
+            render = renderer.render(pose, depth=True)
         depth = measured_depth(render).cpu().numpy() * self._frame.view_from_model.scale
         behind = torch.tensor(wanted.background) - torch.tensor(self._trained.model.background)
         colour = render.colour.cpu() + (1 - render.alpha.cpu())[..., None] * behind
@@ -229,20 +244,23 @@ class Painter:
         if not known.any() or (colouring == "sigma" and self._grid is None):
             return rgb, None
         in_geo = place[known] + self._frame.middle_in_geo
+        if colouring == "sigma" and self._grid is not None:
+            covered = self._grid.covers(in_geo)  # beyond the scene, the σ of its rim says nothing
+            known[known], in_geo = covered, in_geo[covered]
         if colouring == "height":
             values[known] = in_geo[:, 2]
         elif colouring == "sigma" and self._grid is not None:
             values[known] = np.sqrt(np.trace(self._grid.cov_at(in_geo), axis1=1, axis2=2))
         else:
             values[known] = photographs_that_see(self._trained, in_geo)
-        low, high = np.quantile(values[known], [0.02, 0.98]).tolist()
+        low, high = np.quantile(values[known], [0.02, 0.98]).tolist() if known.any() else (0.0, 1.0)
         tint = colours_of(values.ravel(), low, high).reshape(*values.shape, 3)
         whole = cv2.resize(np.ascontiguousarray(tint), rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST)
         is_known = cv2.resize(known.astype(np.uint8), rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
         grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)[..., None]
         mixed = np.where(is_known[..., None], _TINT * whole + (1 - _TINT) * grey, grey)  # grey: not known
         mixed = np.where((depth > 0)[..., None], mixed, rgb)
-        return np.asarray(mixed, dtype=np.uint8), (low, high)
+        return np.asarray(mixed, dtype=np.uint8), (low, high) if known.any() else None
 
     def _blended(self, rgb: ByteArray, wanted: Wanted, pose: ViewPose) -> ByteArray:
         """Return a picture with the photograph over it, as the photograph's lens shows the picture's rays."""

@@ -56,10 +56,11 @@ class PictureRequest(CameraRequest):
     background: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field((0.0, 0.0, 0.0), min_length=3, max_length=3)
     box: Box | None = None
     quality: Annotated[int, Field(ge=10, le=95)] = 80
+    moving: bool = False
 
     def wanted(self) -> Wanted:
         red, green, blue = self.background
-        return Wanted(self.photograph, self.share, self.colouring, (red, green, blue), self.box)
+        return Wanted(self.photograph, self.share, self.colouring, (red, green, blue), self.box, self.moving)
 
 
 class PickRequest(CameraRequest):

@@ -87,11 +87,17 @@ class Viewer:
         self._surveyed = {p.name: p for p in (*trained.survey.control_points, *trained.survey.check_points)}
         self._scene = described_scene(workspace, self.model, self.frame)
         # The Gaussians are sorted now, so that the first click does not wait.
-        self._sorting = threading.Thread(target=lambda: renderer.blocks)
+        self._ended = threading.Event()
+        self._sorting = threading.Thread(target=self._prepare, args=(renderer,))
         self._sorting.start()
+
+    def _prepare(self, renderer: ModelRenderer) -> None:
+        renderer.blocks  # noqa: B018
+        self._painter.prepare_motion(self._ended)
 
     def close(self) -> None:
         self.jobs.close()
+        self._ended.set()
         self._sorting.join()  # torch ends the whole process where Python's end takes a thread away from it
 
     # What is seen

@@ -275,6 +275,7 @@ def test_a_place_is_seen_coloured_and_cut_out(hill: Opened) -> None:
         hill.page.select_option("#colouring", colouring)
         # The legend of a picture asked for before may still arrive.
         expect(legend).to_have_text(re.compile(unit), timeout=PATIENCE_MS)
+    expect(legend).to_contain_text("grey: not known")
     low, high = (float(text) for text in re.findall(r"-?\d+\.\d", str(legend.text_content())))
     level = float(true[2] - on_ground(0, 0)[2])
     assert low - level == pytest.approx(0.0, abs=0.7) and 3 < high - level < 7
@@ -424,3 +425,79 @@ def test_what_was_saved_is_shown(hill: Opened) -> None:
     assert "saved" in parse_qs(urlparse(hill.page.url).fragment)["shown"][0].split(",")
     assert hill.camera().camera().position.tolist() != before.camera().position.tolist()
     hill.saved.filter(has_text="wall").get_by_role("button", name="Delete").click()
+
+
+def test_sigma_of_clicks_is_that_of_a_persons_pixel(hill: Opened) -> None:
+    """Thirty distances whose ends are clicked a whole pixel beside the place, or on it: error over σ."""
+    hill.go()
+    for name in ("cameras", "points"):  # a click on one of them measures that
+        hill.page.locator(f"#overlays input[value='{name}']").uncheck()
+    rng, ratios = np.random.default_rng(5), []
+    hill.begin("distance")
+    for _ in range(30):
+        ends = [on_ground(*rng.uniform(-11, 11, 2)) for _ in range(2)]
+        for number, end in enumerate(ends, start=1):
+            x, y = np.array(hill.pixel(end)) + rng.integers(-1, 2, 2)
+            hill.page.mouse.click(x, y)
+            wait(lambda: len(hill.measured()) == number)  # noqa: B023
+        hill.done()
+        length, sigma = hill.quantity("horizontal distance")
+        ratios.append((length - np.linalg.norm((ends[1] - ends[0])[:2])) / sigma)
+        hill.press("New (Esc)")
+        wait(lambda: not hill.measured())
+    assert 0.7 < float(np.sqrt(np.mean(np.square(ratios)))) < 1.4
+
+
+def test_a_click_outside_the_area_is_told(hill: Opened) -> None:
+    hill.go()
+    rings = hill.server.viewer.scene()["boundary"]
+    low, high = np.array(rings[0]).min(axis=0), np.array(rings[0]).max(axis=0)
+    middle = hill.server.viewer.frame.middle_in_geo
+    inside = (low + high)[:2] / 2 + middle[:2]
+    outside = np.array([high[0] + middle[0] + 1.5, inside[1]])
+    told = hill.page.locator(".notice").filter(has_text="outside the area of interest")
+    hill.begin("point")
+    hill.click_all([on_ground(*inside)])
+    assert told.count() == 0
+    hill.begin("point")
+    hill.click_all([on_ground(*outside)])
+    expect(told).to_have_count(1)
+
+
+def test_a_change_of_tab_draws_nothing_anew(hill: Opened) -> None:
+    hill.go()
+    asked: list[str] = []
+    hill.page.on("request", lambda request: asked.append(request.url) if "/picture" in request.url else None)
+    for name in ("Measure", "Mark", "See"):
+        hill.tab(name)
+        hill.settle()
+    assert asked == []
+    hill.page.locator("#overlay").focus()
+    hill.page.keyboard.press("ArrowLeft")
+    wait(lambda: len(asked) > 0)
+    hill.settle()
+
+
+def test_results_are_above_the_fold_of_a_phone(server: ViewerServer, browser: Browser) -> None:
+    view = opened(server, browser, {"width": 390, "height": 760})
+    page = view.page
+    try:
+        page.locator("#fold").click()
+        view.begin("distance")
+        view.settle()
+        ends = [on_ground(-8, 2), on_ground(6, 4)]
+        panel = page.locator("#panel").bounding_box()
+        assert panel is not None and all(view.pixel(end)[1] < panel["y"] for end in ends)
+        view.click_all(ends)
+        view.done()
+        row = page.locator('[data-quantity="distance"]')
+        box = row.bounding_box()
+        assert (
+            box is not None and box["y"] >= 0 and box["y"] + box["height"] <= 760 and box["x"] + box["width"] <= 390
+        )
+        hit = "([x, y]) => document.elementFromPoint(x, y)?.closest('[data-quantity]') !== null"
+        assert page.evaluate(hit, [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])  # nothing over it
+        assert page.evaluate("() => document.querySelector('#panel').scrollTop") == 0
+    finally:
+        page.close()
+    assert (view.outside, view.problems) == ([], [])

@@ -61,7 +61,7 @@ async function draw(longest, quality) {
   try {
     const body = {
       rotation: seen.rotation, position: seen.position, fov: seen.fov, ...size, quality, photograph: state.photo,
-      share: state.share, colouring, background: background(), box: state.box,
+      share: state.share, colouring, background: background(), box: state.box, moving: longest < MOST_PX,
     };
     const data = await (await ask("picture", { method: "POST", body, signal: controller.signal })).arrayBuffer();
     const length = new DataView(data).getUint32(0, true);
