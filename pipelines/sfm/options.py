@@ -36,7 +36,11 @@ class SfmOptions(StageOptions):
         "learned: for all pairs.",
     )
     import_model: InputPath | None = Field(
-        None, description="Use this COLMAP model instead of reconstructing.", json_schema_extra={"flag": "--import"}
+        None,
+        description="Use the cameras that another program has solved: the folder of a COLMAP model, an OPF project "
+        "(.opf), Metashape's cameras (XML), OpenSfM's or ODM's reconstruction.json, ODM's shots.geojson, "
+        "nerfstudio's transforms.json, or RealityScan's CSV. Points are triangulated where the file has none.",
+        json_schema_extra={"flag": "--import"},
     )
     triangulate: bool = Field(
         False,
