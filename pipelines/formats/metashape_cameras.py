@@ -20,6 +20,7 @@ from pipelines.core.products import Remark
 from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
 from pipelines.formats.solved_cameras import (
+    LONGEST_SIDE_PX,
     PhotoSize,
     SolvedCameras,
     SolvedPhotograph,
@@ -35,7 +36,7 @@ from pipelines.geometry.similarity import Similarity
 PROGRAM = "Metashape"
 _MAX_BYTES = 256 * 1024 * 1024
 _LONGEST_TEXT = 1 << 16
-_MOST_CAMERAS, _LONGEST_SIDE_PX = 1_000_000, 1_000_000
+_MOST_CAMERAS = 1_000_000
 _CALIBRATION = frozenset({"f", "fx", "fy", "cx", "cy", "b1", "b2", "skew"}) | {
     f"{letter}{number}" for letter in "kp" for number in (1, 2, 3, 4)
 }
@@ -272,7 +273,7 @@ class _Reader(XmlReader):
             size = int(values["width"]), int(values["height"])
         except (KeyError, ValueError) as error:
             raise self.fault("not-a-number", "the resolution has no width and height", "resolution") from error
-        if not 0 < min(size) <= max(size) <= _LONGEST_SIDE_PX:
+        if not 0 < min(size) <= max(size) <= LONGEST_SIDE_PX:
             raise self.fault(
                 "lens-impossible", f"a picture has no {size[0]:.4g}×{size[1]:.4g} pixels", "resolution"
             )

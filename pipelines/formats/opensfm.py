@@ -24,6 +24,7 @@ from pipelines.core.files import file_size, reading
 from pipelines.core.products import Remark, load_json
 from pipelines.core.types import FloatArray, IntArray, Vector3
 from pipelines.formats.solved_cameras import (
+    LONGEST_SIDE_PX,
     Foreign,
     PhotoSize,
     SolvedCameras,
@@ -46,8 +47,8 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 class _Camera(Foreign):
     projection_type: str
-    width: int
-    height: int
+    width: int = Field(gt=0, le=LONGEST_SIDE_PX)
+    height: int = Field(gt=0, le=LONGEST_SIDE_PX)
     focal: float | None = None
     focal_x: float | None = None
     focal_y: float | None = None

@@ -28,10 +28,9 @@ from pipelines.geometry.sparse_model import SparseModel
 # Width and height of the photograph that a name in a file means; None: it is none of the survey's.
 PhotoSize = Callable[[str], tuple[int, int] | None]
 
-MAX_BYTES = 1 << 30
 _MOST_OFF_ROTATION = 1e-3  # of the entries of R Rᵀ; programs write four decimals and more
 _FARTHEST = 1e9  # the Earth's radius is 6.4e6 m
-_LONGEST_SIDE_PX = 1_000_000
+LONGEST_SIDE_PX = 1_000_000
 _FAR = 100.0  # extents of the cameras, beyond which the world is shifted
 # A lens that is replaced by another: said above, refused above (px, and of the longer side).
 _SAID_PX, _MOST_PX, _MOST_OF_SIDE = 0.05, 2.0, 2e-3
@@ -170,7 +169,7 @@ def _cameras(
             raise InputError("lens-missing", message, path=path, field="cameras")
         lens = lenses[key]
         width, height = lens.size
-        sides_fit = 0 < width <= _LONGEST_SIDE_PX and 0 < height <= _LONGEST_SIDE_PX
+        sides_fit = 0 < width <= LONGEST_SIDE_PX and 0 < height <= LONGEST_SIDE_PX
         if not sides_fit or not np.isfinite(lens.start.params).all():
             message = f"The camera {key[:80]!r} of {width}×{height} pixels has parameters that no camera has."
             raise InputError("lens-impossible", message, path=path, field="cameras")

@@ -14,6 +14,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipelines.core.errors import InputError
+from pipelines.core.fingerprints import fingerprints
+from pipelines.core.stages import BY_NAME
 from pipelines.formats.colmap import flatten, write_sparse
 from pipelines.formats.solved_cameras import SolvedCameras
 from pipelines.geometry.cameras import Camera, full_parameters, project, undistort
@@ -21,10 +23,11 @@ from pipelines.geometry.similarity import umeyama
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.sfm.foreign_cameras import foreign_file
 from pipelines.sfm.imported_model import ImportedModel, import_model, import_poses
+from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import Survey
 from tests import foreign_files as write
 from tests.refusals import codes, logged_codes, refused, said
-from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of
+from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, write_workspace
 
 pytest.importorskip("pycolmap")
 
@@ -346,3 +349,23 @@ def test_a_frame_of_another_scale_and_turn_is_a_similarity(
     fitted = umeyama(found.cam_center_in_local, model.cam_center_in_local)
     np.testing.assert_allclose(fitted.apply(found.cam_center_in_local), model.cam_center_in_local, atol=1e-7)
     assert np.abs(found.cam_center_in_local).max() < 1e4
+
+
+def test_files_beside_the_cameras_count_for_staleness(surveyed: tuple[SparseModel, Survey], tmp_path: Path) -> None:
+    model, survey = surveyed
+    workspace = write_workspace(tmp_path / "ws", survey, model)
+    spec = BY_NAME["sfm"]
+
+    def fingerprint(path: Path) -> str:
+        return fingerprints(workspace, spec, SfmOptions(import_model=path), {}).hashes["--import"]
+
+    beside = {
+        write.opensfm(model, tmp_path / "reconstruction.json"): tmp_path / "tracks.csv",
+        write.odm(model, tmp_path / "odm") / "odm_report/shots.geojson": tmp_path / "odm/cameras.json",
+        write.opf(model, tmp_path / "opf"): tmp_path / "opf/pixels.bin",
+    }
+    for path, other in beside.items():
+        before = fingerprint(path)
+        assert fingerprint(path) == before
+        other.write_bytes(other.read_bytes() + b" ")
+        assert fingerprint(path) != before
