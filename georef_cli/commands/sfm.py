@@ -35,14 +35,16 @@ command = _SfmCommand(
     """
     Which images are matched follows from their positions and view directions. Features and matches of a large
     survey are computed in chunks, as many at a time as cores and memory allow; a finished chunk is kept when the
-    command is interrupted. The result is a COLMAP model, sfm/sparse, which COLMAP itself opens; --import takes a
-    model that was made elsewhere.
+    command is interrupted. The result is a COLMAP model, sfm/sparse, which COLMAP itself opens; --import takes
+    the cameras that COLMAP, Metashape, PIX4Dmatic (OPF), OpenSfM, OpenDroneMap, nerfstudio or RealityScan has
+    solved.
 
     \b
     Examples:
       georef sfm flight
       georef sfm flight --mapper global --max-image-size 1600
       georef sfm flight --import colmap/sparse/0
+      georef sfm flight --import cameras.xml
       georef sfm flight --cluster tls://scheduler:8786 --certificates certificates
     """,
     extra=[_CHUNK, *ENGINE],

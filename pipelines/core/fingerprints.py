@@ -78,7 +78,9 @@ def fingerprints(
                 result.hashes[flag] = _hash_listing({inside: record.sha256 for inside, record in records.items()})
             else:
                 file_size(path, field=flag)
-                result.hashes[flag] = _hash_file(path)
+                beside = {inside: _hash_file(file) for inside, file in _beside(path, markers[name]).items()}
+                whole = _hash_file(path)
+                result.hashes[flag] = _hash_listing({"": whole, **beside}) if beside else whole
     except OSError as error:
         raise InputError("file-unreadable", f"cannot be read: {error.strerror}.", path=error.filename) from error
     return result
@@ -186,6 +188,13 @@ def _record(path: Path) -> FileRecord:
     except OSError:
         sha256 = ""
     return FileRecord(size=stat.st_size, mtime_ns=stat.st_mtime_ns, sha256=sha256)
+
+
+def _beside(path: Path, marker: InputMarker) -> dict[str, Path]:
+    """Return the files that count with a file, by their paths from its folder."""
+    patterns = dict(marker.beside).get(path.suffix.lower(), ())
+    found = {file for pattern in patterns for file in path.parent.glob(pattern) if file.is_file() and file != path}
+    return {Path(os.path.relpath(file, path.parent)).as_posix(): file for file in found}
 
 
 def _input_files(folder: Path, workspace_root: Path, marker: InputMarker) -> dict[str, Path]:

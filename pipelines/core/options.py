@@ -40,11 +40,13 @@ class InputMarker:
     """Mark of a path whose content decides the stage's result: its fingerprint enters the manifest.
 
     In a folder, files with the suffixes, in lower case, count; without any, all do. With `only`, the files at these
-    places in the folder count, as far as there are any.
+    places in the folder count, as far as there are any. Files `beside` a file count with it: by its suffix, in lower
+    case, patterns in its folder.
     """
 
     suffixes: frozenset[str] = frozenset()
     only: frozenset[str] = frozenset()
+    beside: tuple[tuple[str, tuple[str, ...]], ...] = ()
 
 
 class WrittenMarker:

@@ -23,8 +23,8 @@ from pipelines.core.types import FloatArray
 from pipelines.formats.tables import table_text
 from pipelines.geometry.cameras import Camera, distort, full_parameters, undistort
 
-_FISHEYE = "OPENCV_FISHEYE"
-_CAM_FROM_GL = np.diag([1.0, -1.0, -1.0])
+FISHEYE = "OPENCV_FISHEYE"
+CAM_FROM_GL = np.diag([1.0, -1.0, -1.0])
 _LENS_SAMPLES = 25  # pixels along each side of an image that a lens is fitted to
 _METRES, _DEGREES, _ANGLE = "%.4f", "%.9f", "%.6f"  # 0.1 mm; 0.1 mm on the ground; 1 cm at 500 km
 _EASTING_NORTHING = ("x", "y", "z")
@@ -63,9 +63,9 @@ def lens_of(camera: Camera) -> Lens:
     fx, fy, cx, cy, *distortion = full_parameters(camera).tolist()
     place = {"w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
     k1, k2, p1, p2, k3, *rational = distortion
-    if camera.model == _FISHEYE:
+    if camera.model == FISHEYE:
         fisheye = dict(zip(("k1", "k2", "k3", "k4"), distortion[:4], strict=True))
-        return Lens(_FISHEYE, {**place, **fisheye}, 0.0)
+        return Lens(FISHEYE, {**place, **fisheye}, 0.0)
     if not any(rational):
         return Lens("OPENCV", {**place, "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2}, 0.0)
     fitted, error = _polynomial(camera, np.array([fx, fy]), np.array([cx, cy]))
@@ -103,7 +103,7 @@ def write_transforms(path: Path, frames: Sequence[Frame], lenses: Sequence[Lens]
     listed: list[dict[str, Any]] = []
     for frame, lens in zip(frames, lenses, strict=True):
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = frame.world_from_cam @ _CAM_FROM_GL, frame.center_in_world
+        matrix[:3, :3], matrix[:3, 3] = frame.world_from_cam @ CAM_FROM_GL, frame.center_in_world
         listed.append({"file_path": frame.name, **lens.intrinsics, "transform_matrix": matrix.tolist()})
     names = {split: [frame.name for frame in frames if frame.split == split] for split in ("train", "test")}
     lists = {"train": names["train"], "val": names["test"], "test": names["test"]} if names["test"] else {}

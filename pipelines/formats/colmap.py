@@ -339,6 +339,11 @@ def write_sparse(model: SparseModel, path: Path) -> None:
 
     Every image gets its own frame and every camera a trivial rig. Raises as `write_reconstruction`.
     """
+    write_reconstruction(reconstruction_of(model), path)
+
+
+def reconstruction_of(model: SparseModel) -> Any:
+    """Return a model as a `pycolmap.Reconstruction`, in which every image has its own frame."""
     pycolmap = pycolmap_module()
     reconstruction = pycolmap.Reconstruction()
     for camera_id, camera in model.cameras.items():
@@ -369,4 +374,4 @@ def write_sparse(model: SparseModel, path: Path) -> None:
             for image_id, place in zip(observer[run], rank[run], strict=True)
         ]
         reconstruction.add_point3D_with_id(int(point_id), point)
-    write_reconstruction(reconstruction, path)
+    return reconstruction

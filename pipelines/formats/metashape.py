@@ -17,13 +17,10 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
-from xml.sax import ContentHandler, SAXException
 
 import numpy as np
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import file_size, reading
 from pipelines.formats import column_names, tables
 from pipelines.formats.ground_points import GroundPoints, ListedMark, ListedPoint, without_repeats
 from pipelines.formats.trajectory_csv import (
@@ -32,15 +29,11 @@ from pipelines.formats.trajectory_csv import (
     complete,
     photogrammetric_quaternions,
 )
-
-if TYPE_CHECKING:
-    from xml.sax.xmlreader import AttributesImpl, Locator
+from pipelines.formats.xml_events import OFF, XmlReader, read_xml
 
 MARKERS = "Metashape's markers"
 _MAX_BYTES = 64 * 1024 * 1024
-_LONGEST_TAG = 1 << 20  # The parser begins an unfinished tag again with every part of the file.
-_LONGEST_CRS, _MAX_DEPTH = 1 << 16, 100
-_OFF = frozenset({"0", "false"})
+_LONGEST_CRS = 1 << 16
 _NO_MARKERS = "no marker has coordinates: export markers with their reference"
 
 
@@ -51,40 +44,16 @@ def read_markers_xml(path: Path) -> GroundPoints:
         InputError: unreadable, not well-formed XML, not of Metashape, several chunks, a value that is no number, or
             no marker with coordinates.
     """
-    from defusedxml.common import DefusedXmlException
-    from defusedxml.sax import make_parser
-
-    file_size(path, limit_bytes=_MAX_BYTES, kind="file of markers")
     reader = _Reader(path)
-    parser = make_parser()
-    parser.forbid_dtd = True
-    parser.setContentHandler(reader)
-    reader.setDocumentLocator(parser)
-    try:
-        with reading(path), path.open("rb") as stream:
-            while data := stream.read(_LONGEST_TAG):
-                before = reader.events
-                parser.feed(data)
-                if len(data) == _LONGEST_TAG and reader.events == before:
-                    raise reader.fault(
-                        "xml-tag-too-long", f"a tag is longer than {_LONGEST_TAG >> 20} MiB, the limit"
-                    )
-        parser.close()
-    except (SAXException, DefusedXmlException, ValueError, LookupError) as error:
-        message = " ".join(str(error).split())[:200]
-        raise InputError("xml-invalid", f"The file is not well-formed XML: {message}", path=path) from error
+    read_xml(reader, limit_bytes=_MAX_BYTES, kind="file of markers")
     return reader.result()
 
 
-class _Reader(ContentHandler):
+class _Reader(XmlReader):
     """Reader of one document, element by element."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__()
-        self._path = path
-        self._place: Locator | None = None
-        self.events = 0
-        self._open: list[str] = []
+        super().__init__(path)
         self._chunks = 0
         self._marker: tuple[str, str] | None = None  # id and label
         self._projected: str | None = None  # id
@@ -97,16 +66,7 @@ class _Reader(ContentHandler):
         self._projections: list[tuple[int, str, str, float, float]] = []  # line, marker, camera, x, y
         self._left_out: list[str] = []
 
-    def setDocumentLocator(self, locator: Locator) -> None:
-        self._place = locator
-
-    def startElement(self, name: str, attrs: AttributesImpl) -> None:
-        self.events += 1
-        values = {str(key): str(value) for key, value in attrs.items()}
-        parent = self._open[-1] if self._open else ""
-        self._open.append(name)
-        if len(self._open) > _MAX_DEPTH:
-            raise self.fault("xml-too-deep", f"the elements are nested more than {_MAX_DEPTH} deep, the limit")
+    def begin(self, name: str, values: dict[str, str], parent: str) -> None:
         if name == "chunk":
             self._chunks += 1
             if self._chunks > 1:
@@ -124,22 +84,19 @@ class _Reader(ContentHandler):
         elif name == "location" and parent == "marker" and self._projected is not None:
             self._read_projection(values)
 
-    def endElement(self, name: str) -> None:
-        self.events += 1
-        self._open.pop()
+    def end(self, name: str) -> None:
         if name == "marker":
             self._marker = self._projected = None
 
-    def characters(self, content: str) -> None:
-        self.events += 1
-        if self._open and self._open[-1] == "reference":
+    def text(self, content: str) -> None:
+        if self.open and self.open[-1] == "reference":
             self._crs += content
             if len(self._crs) > _LONGEST_CRS:
                 raise self.fault("crs-too-long", f"the CRS is longer than {_LONGEST_CRS} characters, the limit")
 
     def result(self) -> GroundPoints:
         if not self._points:
-            raise InputError("no-markers", _NO_MARKERS, path=self._path)
+            raise InputError("no-markers", _NO_MARKERS, path=self.path)
         known = {point.name for point in self._points}
         marks = [
             ListedMark(line, self._names[marker], self._labels.get(camera, f"camera {camera}"), x, y)
@@ -148,22 +105,14 @@ class _Reader(ContentHandler):
         ]
         crs = self._crs.strip()
         return GroundPoints(
-            path=self._path,
+            path=self.path,
             kind=MARKERS,
-            points=without_repeats(self._points, self._path),
+            points=without_repeats(self._points, self.path),
             marks=tuple(marks),
             crs_text=crs or None,
             crs_line=self._crs_line,
             left_out=tuple(self._left_out),
         )
-
-    @property
-    def line(self) -> int:
-        return 1 if self._place is None else int(self._place.getLineNumber() or 1)
-
-    def fault(self, code: str, message: str, field: str | None = None) -> InputError:
-        """Return the error of the line that is being read."""
-        return InputError(code, message, path=self._path, line=self.line, field=field)
 
     def _read_point(self, values: dict[str, str]) -> None:
         marker, name = self._marker or ("", "")
@@ -183,16 +132,16 @@ class _Reader(ContentHandler):
                 xyz=(self._number(values, "x"), self._number(values, "y"), self._number(values, "z")),
                 sigma_h_m=max(horizontal) if horizontal else both,
                 sigma_v_m=self._sigma(values, "sz") or both,
-                is_check=values.get("enabled", "true").lower() in _OFF,
+                is_check=values.get("enabled", "true").lower() in OFF,
             )
         )
 
     def _read_projection(self, values: dict[str, str]) -> None:
         marker, camera = self._projected or "", values.get("camera_id", "")
-        if not {"x", "y"} <= set(values) or values.get("valid", "true").lower() in _OFF:
+        if not {"x", "y"} <= set(values) or values.get("valid", "true").lower() in OFF:
             return
-        if values.get("pinned", "true").lower() in _OFF:
-            self._left_out.append(f"{self._path.name}:{self.line}")
+        if values.get("pinned", "true").lower() in OFF:
+            self._left_out.append(f"{self.path.name}:{self.line}")
             return
         self._projections.append((self.line, marker, camera, self._number(values, "x"), self._number(values, "y")))
 
@@ -315,7 +264,7 @@ def _reference(path: Path) -> tuple[tables.Table, bool | None]:
 
 
 def _is_enabled(row: tables.Row) -> bool:
-    return "enabled" not in row.columns or row.text("enabled").lower() not in _OFF
+    return "enabled" not in row.columns or row.text("enabled").lower() not in OFF
 
 
 def _sigma_m(row: tables.Row) -> tuple[float | None, float | None]:

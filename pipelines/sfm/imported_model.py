@@ -1,18 +1,27 @@
-"""Engine `imported`: a COLMAP model that another program has made, or points triangulated from its poses."""
+"""Engine `imported`: cameras that another program has solved, with its points or triangulated ones."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Self
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import Progress
 from pipelines.core.workspace import StageRun
-from pipelines.formats.colmap import flatten, load_reconstruction, quiet_colmap, write_reconstruction
+from pipelines.formats.colmap import (
+    flatten,
+    load_reconstruction,
+    quiet_colmap,
+    reconstruction_of,
+    write_reconstruction,
+)
+from pipelines.formats.solved_cameras import PhotoSize
 from pipelines.sfm.chunks import remove_chunks
 from pipelines.sfm.colmap_reconstruction import ColmapReconstructor
 from pipelines.sfm.estimate import ReconstructionEstimate, estimate_reconstruction
 from pipelines.sfm.features import SfmJob
+from pipelines.sfm.foreign_cameras import foreign_file
 from pipelines.sfm.known_poses import triangulated_from
 from pipelines.sfm.model_poses import check_observations
 from pipelines.sfm.options import SfmOptions
@@ -31,11 +40,21 @@ _SEEN = 0.5  # of the images with a pose: where fewer have observations, the mod
 
 @dataclass(frozen=True)
 class ImportedModel:
-    """Import of a COLMAP model from a folder; without `triangulates` nothing is computed."""
+    """Import of solved cameras from a path; without `triangulates` nothing is computed."""
 
     path: Path
     triangulates: bool = False
     remedy: str = "COLMAP cannot read the imported model: export it again"
+
+    @classmethod
+    def of(cls, path: Path, *, triangulates: bool) -> Self:
+        """Return the import of a path; cameras without points in their file are triangulated in any case.
+
+        Raises:
+            InputError: the path is a file without such cameras.
+        """
+        file = foreign_file(path)
+        return cls(path, triangulates or (file is not None and not file.has_points))
 
     def estimate(
         self, photographs: int, photo_px: tuple[int, int], options: SfmOptions
@@ -46,7 +65,9 @@ class ImportedModel:
         if not self.triangulates:
             return True
         with quiet_colmap():
-            import_poses(self.path, survey)  # What cannot be imported is said before features are computed.
+            import_poses(
+                self.path, survey, says=False
+            )  # What cannot be imported is said before features are computed.
         return ColmapReconstructor().prepare(stage, survey, options)
 
     def reconstruct(self, job: SfmJob, progress: Progress) -> Any:
@@ -65,13 +86,14 @@ class ImportedModel:
 
 
 def import_model(path: Path, survey: Survey) -> Any:
-    """Return the COLMAP model at `path` (a `pycolmap.Reconstruction`), reduced to the survey's images.
+    """Return the solved cameras at `path` as a `pycolmap.Reconstruction`, reduced to the survey's images.
 
-    The folder is that of the model, or of a COLMAP project that has it in `sparse/0` or `sparse`. Images are
-    renamed as in the survey. Errors of points are computed from the observations.
+    The path is a file of another program (`foreign_cameras.py`), or a folder: that of a COLMAP model, of a COLMAP
+    project that has it in `sparse/0` or `sparse`, or of another program's project. Images are renamed as in the
+    survey. Errors of points are computed from the observations.
 
     Raises:
-        InputError: the folder holds no COLMAP model, fewer than 3 of its images are in the survey, its cameras have
+        InputError: the path holds no solved cameras, fewer than 3 of its images are in the survey, its cameras have
             other sizes than the photographs, its images have no observations, or its poses contradict them.
     """
     model, folder = import_poses(path, survey)
@@ -81,32 +103,58 @@ def import_model(path: Path, survey: Survey) -> Any:
     return model
 
 
-def import_poses(path: Path, survey: Survey) -> tuple[Any, Path]:
-    """Return the model at `path` reduced to the survey's images, whatever it observes, and its folder.
+def import_poses(path: Path, survey: Survey, *, says: bool = True) -> tuple[Any, Path]:
+    """Return the model at `path` reduced to the survey's images, whatever it observes, and its folder or file.
 
-    Raises as `import_model`, but for observations.
+    Remarks are logged if it `says` them. Raises as `import_model`, but for observations.
     """
-    folder = find_model(path)
-    model = load_reconstruction(folder)
-    foreign = _rename(model, survey, folder)
+    warn = log.warning if says else log.debug
+    file = foreign_file(path)
+    if file is None:
+        source = find_model(path.parent if path.is_file() else path)
+        model = load_reconstruction(source)
+    else:
+        source = file.path
+        solved = file.read(source, _photo_size(survey, source))
+        for remark in solved.remarks:
+            warn("%s", remark.sentence, extra={"code": remark.code})
+        model = reconstruction_of(solved.model)
+    foreign = _rename(model, survey, source, warn)
     for frame_id in {image.frame_id for image in foreign}:  # The images of a rig share a frame.
         model.deregister_frame(frame_id)
+    others = [image.name for image in foreign] if file is None else list(solved.foreign)
     if model.num_reg_images() < _FEWEST_IMAGES:
-        example = foreign[0].name if foreign else "none"
+        example = others[0] if others else "none"
         raise InputError(
             "too-few-images-in-survey",
             f"{model.num_reg_images()} of its images are in the survey, and at least three are needed. The model "
             f"has {example!r} …, the survey {survey.images[0].name!r} …: names may differ in folder, case and "
             "suffix only. Give `georef ingest` the photographs of the model, or rename its images.",
-            path=folder,
+            path=source,
         )
-    if foreign:
-        log.warning("%d images of the imported model are not in the survey, and were left out.", len(foreign))
-    _check_cameras(model, survey, folder)
-    return model, folder
+    if others:
+        warn("%d images of the imported model are not in the survey, and were left out.", len(others))
+    _check_cameras(model, survey, source, warn)
+    return model, source
 
 
-def _rename(model: Any, survey: Survey, folder: Path) -> list[Any]:
+def _photo_size(survey: Survey, source: Path) -> PhotoSize:
+    """Return what gives the size of the photograph that a name in a file means; names match as in tables."""
+    names, sizes = ImageNames(image.name for image in survey.images), _photo_sizes(survey)
+
+    def photo_size(name: str) -> tuple[int, int] | None:
+        found = names.find(_relative(name), path=source) if name.strip() else None
+        return None if found is None else sizes[found]
+
+    return photo_size
+
+
+def _photo_sizes(survey: Survey) -> dict[str, tuple[int, int]]:
+    priors = {prior.camera_id: prior for prior in survey.cameras}
+    return {image.name: (priors[image.camera_id].width, priors[image.camera_id].height) for image in survey.images}
+
+
+def _rename(model: Any, survey: Survey, folder: Path, warn: Callable[..., None]) -> list[Any]:
     """Give the posed images of a model their names in the survey; return those that are none of its images.
 
     Raises:
@@ -129,7 +177,7 @@ def _rename(model: Any, survey: Survey, folder: Path) -> list[Any]:
             renamed.append(f"{image.name} is {found}")
             image.name = found
     if renamed:
-        log.warning(
+        warn(
             "%d images of the model have another folder, case or suffix than their photographs (%s).",
             len(renamed),
             renamed[0],
@@ -213,11 +261,8 @@ def _number_of_images(folder: Path) -> int:
         return 0
 
 
-def _check_cameras(model: Any, survey: Survey, folder: Path) -> None:
-    priors = {prior.camera_id: prior for prior in survey.cameras}
-    size_of = {
-        image.name: (priors[image.camera_id].width, priors[image.camera_id].height) for image in survey.images
-    }
+def _check_cameras(model: Any, survey: Survey, folder: Path, warn: Callable[..., None]) -> None:
+    size_of = _photo_sizes(survey)
     flat = set()
     for image_id in model.reg_image_ids():
         image = model.images[image_id]
@@ -236,7 +281,7 @@ def _check_cameras(model: Any, survey: Survey, folder: Path) -> None:
         if undistorted:
             flat.add(image.camera_id)
     if flat:
-        log.warning(
+        warn(
             "The imported model has no lens distortion (camera %s). If it was made of undistorted copies, import "
             "the model of the photographs themselves.",
             ", ".join(map(str, sorted(flat))),

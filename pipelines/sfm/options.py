@@ -1,12 +1,20 @@
 """Options of `georef sfm`, and of the adjustment with position priors."""
 
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from pipelines.core.options import EFFORT, InputPath, StageOptions
+from pipelines.core.options import EFFORT, InputMarker, StageOptions
 
 _DOUBLED_BELOW_PX = 1000
+_SOLVED = frozenset({".bin", ".txt", ".json", ".geojson", ".opf", ".gltf", ".xml", ".csv"})
+_BESIDE = (
+    (".opf", ("**/*.json", "**/*.gltf", "**/*.bin")),
+    (".json", ("tracks.csv",)),
+    (".geojson", ("cameras.json", "../cameras.json")),
+)
+SolvedCamerasPath = Annotated[Path, InputMarker(_SOLVED, beside=_BESIDE)]
 
 
 class SfmOptions(StageOptions):
@@ -35,8 +43,12 @@ class SfmOptions(StageOptions):
         description="Features beside SIFT's; auto: learned ones for photographs that stay out, if installed; "
         "learned: for all pairs.",
     )
-    import_model: InputPath | None = Field(
-        None, description="Use this COLMAP model instead of reconstructing.", json_schema_extra={"flag": "--import"}
+    import_model: SolvedCamerasPath | None = Field(
+        None,
+        description="Use the cameras that another program has solved: the folder of a COLMAP model, an OPF project "
+        "(.opf), Metashape's cameras (XML), OpenSfM's or ODM's reconstruction.json, ODM's shots.geojson, "
+        "nerfstudio's transforms.json, or RealityScan's CSV. Points are triangulated where the file has none.",
+        json_schema_extra={"flag": "--import"},
     )
     triangulate: bool = Field(
         False,

@@ -48,4 +48,4 @@ class Reconstructor(Protocol):
 def reconstructor_of(options: SfmOptions) -> Reconstructor:
     if options.import_model is None:
         return ColmapReconstructor()
-    return ImportedModel(options.import_model, options.triangulate)
+    return ImportedModel.of(options.import_model, triangulates=options.triangulate)

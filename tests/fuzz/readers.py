@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -48,7 +48,9 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.ingest.bag_inspection import inspect_bag
+from pipelines.sfm.foreign_cameras import foreign_file
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
 from pipelines.survey.calibrated import NavigationTrack
@@ -57,12 +59,12 @@ from pipelines.survey.report import EvaluationReport
 from pipelines.survey.survey import RigCalibration, RigEstimate, Survey
 from pipelines.survey.trained_model import TrainedModel
 from pipelines.train.trainer import load_checkpoint
-from tests import bags, gopro
+from tests import bags, foreign_files, gopro
 from tests.formats.test_surveyors_tables import DEGREES, MRK, POS_HEAD, REFERENCE, SIGMAS, TAIL, XML
 from tests.oracles import read_spz
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg
 from tests.reports import check_points_with, report_with
-from tests.scenes import initial, material, trained_model, write_workspace
+from tests.scenes import Noise, initial, make_scene, material, sparse_model, trained_model, write_workspace
 
 LIMIT = 200  # messages that are decoded
 ProductT = TypeVar("ProductT", bound=BaseModel)
@@ -100,6 +102,24 @@ def _read_photographs(folder: Path) -> None:
         if data is not None:
             read_tags(data)
             _attempt(lambda data=data, path=path: inspect_image(data, path))
+
+
+def _solved(writer: Callable[[SparseModel, Path], Path], name: str) -> Reader:
+    """Return the reader of the cameras that another program has solved."""
+
+    def prepare(folder: Path) -> None:
+        scene = make_scene(images=3, points=8)
+        lens = scene.camera.params.copy()
+        lens[1] = lens[0]  # some programs have one focal length
+        one = replace(scene, camera=replace(scene.camera, params=lens))
+        writer(sparse_model(one, Noise(), np.random.default_rng(0)), folder / name)
+
+    def read(folder: Path) -> None:
+        found = foreign_file(folder / name)
+        if found is not None:
+            found.read(found.path, lambda _: (1200, 900))
+
+    return Reader(prepare, read, "**/*")
 
 
 def _trajectories(folder: Path) -> None:
@@ -421,6 +441,12 @@ READERS: dict[str, Reader] = {
         _each(read_pos),
     ),
     "crs": Reader(_crs, _read_crs, slow=True),
+    "metashape-cameras": _solved(foreign_files.metashape, "cameras.xml"),
+    "opensfm": _solved(foreign_files.opensfm, "reconstruction.json"),
+    "odm-shots": _solved(foreign_files.odm, "odm"),
+    "nerfstudio": _solved(foreign_files.nerfstudio, "transforms.json"),
+    "realityscan": _solved(foreign_files.realityscan, "cameras.csv"),
+    "opf": _solved(foreign_files.opf, "opf"),
     "colmap-binary": Reader(_sparse, read_sparse),
     "colmap-text": Reader(_sparse_text, read_sparse),
     "bag-mcap": Reader(_bag(StoragePlugin.MCAP), _read_bag("bag/*.mcap"), "bag/*.mcap"),

@@ -15,6 +15,7 @@ from pipelines.formats.colmap import load_reconstruction, read_sparse, write_spa
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.stage import run
+from tests import foreign_files as write
 from tests.refusals import refused
 from tests.sfm_scenes import CONFIG
 
@@ -45,6 +46,20 @@ def test_points_are_triangulated_and_poses_stay(mapped: Workspace, tmp_path: Pat
     np.testing.assert_allclose(taken.cam_center_in_local[rows], given.cam_center_in_local, atol=1e-9)
     np.testing.assert_allclose(taken.rotation_cam_from_local[rows], given.rotation_cam_from_local, atol=1e-9)
     # The poses are those of an adjustment of such matches: half as many points at least, errors below 2 px.
+    assert summary.values["points"] > 0.5 * len(given.point_id)
+    assert 0.0 < summary.values["reprojection_error_px"] < 2.0
+
+
+@pytest.mark.slow
+def test_cameras_of_a_file_without_points_are_triangulated_unasked(mapped: Workspace, tmp_path: Path) -> None:
+    given = read_sparse(mapped.path(SPARSE))
+    (out := tmp_path / "sfm.partial").mkdir()
+    path = write.metashape(given, tmp_path / "cameras.xml")
+    summary = run(StageRun(mapped, out), CONFIG.model_copy(update={"import_model": path}))
+    taken = read_sparse(out / "sparse")
+    rows = [taken.image_name.index(name) for name in given.image_name]
+    np.testing.assert_allclose(taken.cam_center_in_local[rows], given.cam_center_in_local, atol=1e-6)
+    np.testing.assert_allclose(taken.rotation_cam_from_local[rows], given.rotation_cam_from_local, atol=1e-6)
     assert summary.values["points"] > 0.5 * len(given.point_id)
     assert 0.0 < summary.values["reprojection_error_px"] < 2.0
 

@@ -1,0 +1,103 @@
+"""RealityScan's (RealityCapture's) table of cameras: Registration ▸ Export ▸ "Internal/External camera parameters".
+
+`#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2`, in any order, with `f` in millimetres of a 36 mm wide
+film, `px` and `py` as shares of the longer side from the middle of the image, and Brown's terms (t1, t2 in OpenCV's
+order). World ← camera (x right, y up, z backward) is R_z(−heading) R_x(pitch) R_y(roll) with x east, y north, z up:
+pitch 0 looks straight down. The scale of `px` and `py` is documented nowhere, and assumed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pipelines.core.errors import InputError
+from pipelines.core.products import Remark
+from pipelines.formats import tables
+from pipelines.formats.camera_files import CAM_FROM_GL
+from pipelines.formats.solved_cameras import PhotoSize, SolvedCameras, SolvedPhotograph, not_placed, solved_cameras
+from pipelines.geometry.lens_fit import Brown, ForeignLens, brown_lens
+
+PROGRAM = "RealityScan"
+_FILM_MM = 36.0
+_NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
+_LENS = ("k1", "k2", "k3", "k4", "t1", "t2")
+_VOCABULARY = {
+    **dict.fromkeys(("name", "image", "filename", "imagename"), "name"),
+    **{name: name for name in ("x", "y", "pitch", "roll", "f", "px", "py", *_LENS)},
+    **dict.fromkeys(("alt", "z", "altitude"), "alt"),
+    **dict.fromkeys(("heading", "yaw"), "heading"),
+    **dict.fromkeys(("focal", "focallength"), "f"),
+}
+_SAID_PX = 1.0
+
+
+def header_line(lines: list[tuple[int, str]]) -> tuple[int, str] | None:
+    """Return number and text of the line that names the columns, or None: this is no such table."""
+    for number, text in lines[:5]:
+        cells = {cell.strip().lstrip("#").strip().lower() for cell in text.split(",")}
+        if {"heading", "pitch", "roll", "f"} <= cells:
+            return number, text
+    return None
+
+
+def read_camera_csv(path: Path, photo_size: PhotoSize) -> SolvedCameras:
+    """Read the cameras of a table; the photographs' own sizes make pixels of its shares.
+
+    Raises:
+        InputError: no such header, a column is missing, a cell is no number, or what `solved_cameras` refuses.
+    """
+    lines = tables.numbered_lines(path)
+    found = header_line(lines)
+    if found is None:
+        message = f"No line names the columns {', '.join(_NEEDED)}: export Internal/External camera parameters."
+        raise InputError("header-missing", message, path=path)
+    number, text = found
+    cells = tables.split(text.lstrip("# "), ",", path=path, line=number)
+    columns, _ = tables.named_columns(cells, _VOCABULARY, path, number)
+    tables.require_columns(columns, _NEEDED, path, number)
+    kept = [(at, line) for at, line in lines if at > number and not line.startswith("#")]
+    rows = tables.table_rows(path, kept, ",", columns)
+    tables.require_rows(rows, path)
+    photographs, lenses, most = [], {}, 0.0
+    for row in rows:
+        name = row.named("name")
+        angles = [-row.finite("heading"), row.finite("pitch"), row.finite("roll")]
+        world_from_gl = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
+        size = photo_size(name)
+        values = {key: row.finite(key) if key in columns and row.text(key) else 0.0 for key in ("px", "py", *_LENS)}
+        focal_mm = row.finite("f")
+        key = repr((focal_mm, tuple(values.items()), size))
+        if size is not None and key not in lenses:
+            if not focal_mm > 0:
+                raise row.fault(
+                    "focal-length-impossible", f"a focal length of {focal_mm:g} mm is not above zero", "f"
+                )
+            lenses[key] = _lens(size, focal_mm, values)
+            most = max(most, max(size) * max(abs(values["px"]), abs(values["py"])))
+        center = np.array([row.finite("x"), row.finite("y"), row.finite("alt")])
+        photographs.append(SolvedPhotograph(name, key, world_from_gl @ CAM_FROM_GL.T, center))
+    remarks = [not_placed(PROGRAM, "the coordinate system of its export")]
+    if most > _SAID_PX:
+        sentence = (
+            "px and py are assumed to be shares of the picture's longer side: they move the principal point by up "
+            f"to {most:.1f} px."
+        )
+        remarks.append(Remark(code="principal-point-assumed", sentence=sentence))
+    return solved_cameras(path, PROGRAM, photographs, lenses, photo_size, remarks=remarks)
+
+
+def _lens(size: tuple[int, int], focal_mm: float, values: dict[str, float]) -> ForeignLens:
+    side = max(size)
+    focal = focal_mm / _FILM_MM * side
+    return brown_lens(
+        Brown(
+            size,
+            (focal, focal),
+            (size[0] / 2 + values["px"] * side, size[1] / 2 + values["py"] * side),
+            radial=(values["k1"], values["k2"], values["k3"], values["k4"]),
+            tangential=(values["t1"], values["t2"]),
+        )
+    )
