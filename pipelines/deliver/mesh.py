@@ -49,6 +49,7 @@ from pipelines.survey.trained_survey import TrainedSurvey, load_trained
 
 _BASE_VOXELS = 4.0  # of the base of a watertight mesh, below its lowest vertex
 _AROUND = 16.0  # spacings around the area: points there hold the surface at its rim
+_PART_M2, _PART_VOXELS = 4.0, 100.0  # least area of an unconnected part: fewer voxels show no form
 _SAMPLE = 200_000  # vertices at most that are measured against the simplified mesh
 _LISTED = 100  # widest holes
 _LEAST_POINTS = 100
@@ -222,7 +223,8 @@ def _surface(
     whole = compact(RawMesh(whole.vertices, whole.faces[inside[whole.faces].all(axis=1)]))
     if not len(whole.faces):
         raise _no_surface(options)
-    whole, islands = without_islands(whole, options.least_part)
+    least_m2 = max(_PART_M2, _PART_VOXELS * voxel_m**2) if options.least_part is None else options.least_part
+    whole, islands = without_islands(whole, least_m2)
     simple = simplified(whole, error_m, folder, progress)
     errors = np.zeros(1)
     if error_m > 0:

@@ -146,7 +146,11 @@ class ExportMeshOptions(CrsOptions, FilledAreaOptions):
         ge=0,
         description="Metres by which the simplification may move the surface; 0: none (default: half a voxel).",
     )
-    least_part: float = Field(4.0, ge=0, description="Leave out unconnected parts with less area, in m².")
+    least_part: float | None = Field(
+        None,
+        ge=0,
+        description="Leave out unconnected parts with less area, in m² (default: 4, or 100 squares of a voxel).",
+    )
     watertight: bool = Field(
         False, description="Close the mesh: holes by fans, outer rims by plumb walls down to a common base."
     )

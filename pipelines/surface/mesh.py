@@ -9,7 +9,6 @@ from scipy.spatial import KDTree
 
 from pipelines.core.types import FloatArray, IntArray
 
-_SMOOTHED = 10  # times that a vertex of a border moves half of the way to the middle of its neighbours
 _NEAR_FACES = 4  # of those nearest a vertex whose distance is measured
 
 
@@ -119,24 +118,6 @@ def open_share(mesh: RawMesh) -> float:
     """Return the share of the edges that have one face."""
     _, count = edges_of(mesh.faces)
     return float(np.mean(count == 1)) if len(count) else 0.0
-
-
-def with_smooth_rims(mesh: RawMesh) -> RawMesh:
-    """Return a mesh whose open borders run straight where they were steps of its faces.
-
-    Vertices of a border move by less than the length of its edges, mostly: a simplification keeps every step
-    otherwise. Where borders meet, they stay.
-    """
-    sides = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    edge, count = edges_of(mesh.faces)
-    border, vertices = sides[count[edge] == 1], mesh.vertices.copy()
-    simple = np.bincount(border.ravel(), minlength=len(vertices)) == 2
-    for _ in range(_SMOOTHED):
-        around = np.zeros_like(vertices)
-        for own, other in ((0, 1), (1, 0)):
-            np.add.at(around, border[:, own], vertices[border[:, other]])
-        vertices[simple] = vertices[simple] / 2 + around[simple] / 4
-    return RawMesh(vertices, mesh.faces)
 
 
 def _rims(mesh: RawMesh) -> tuple[list[IntArray], set[int]]:

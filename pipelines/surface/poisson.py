@@ -18,7 +18,8 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.formats.colmap import quiet_colmap
 from pipelines.formats.mesh_files import read_mesh_ply, write_mesh_ply, write_oriented_points
-from pipelines.surface.mesh import RawMesh, compact, parts_of, with_smooth_rims
+from pipelines.surface.mesh import RawMesh, compact, parts_of
+from pipelines.surface.mesh_rims import with_long_rims, with_smooth_rims
 
 _CUBE = 1.1  # side of the octree over the longest side of the points' box
 _SHALLOWEST, _DEEPEST = 5, 14  # of the octree
@@ -31,6 +32,7 @@ _THREADS = 1
 _CERTAIN = 0.5  # spacings: largest σ of a certain point
 _POINT_WEIGHT = 4.0  # of the points' places over their normals; of 1, 4 and 16 the best on a simulated flight
 _RIM_WEIGHT = 1.0  # of an open edge over the faces in the simplification: rims move by its error at most
+_RIM_ERRORS = 2.0  # of the simplification: by so much its rims may move once more
 _REMEDY = "Give a larger --voxel or a smaller --boundary."
 _POINTS, _SURFACE, _CUT, _SIMPLE = "points.ply", "surface.ply", "cut.ply", "simple.ply"
 
@@ -135,10 +137,11 @@ def solve_poisson(arguments: Mapping[str, Any], progress: Progress) -> None:
 
 
 def simplified(mesh: RawMesh, error_m: float, folder: Path, progress: Progress = SILENT) -> RawMesh:
-    """Return a mesh with fewer faces; its open borders are smoothed first (`with_smooth_rims`).
+    """Return a mesh with fewer faces; its open borders are smoothed before, and get fewer edges after it.
 
     Edges collapse as long as the distances of the new vertex from the planes of the faces that it replaces are not
     above `error_m`, as a root of the sum of squares (Garland and Heckbert, doi 10.1145/258734.258849).
+    Borders, whose course nothing measures, move by twice as much (`with_long_rims`).
     """
     if error_m <= 0 or not len(mesh.faces):
         return mesh
@@ -147,9 +150,10 @@ def simplified(mesh: RawMesh, error_m: float, folder: Path, progress: Progress =
     arguments = {"mesh": str(folder / _CUT), "simple": str(folder / _SIMPLE), "error": error_m}
     try:
         run_in_child(f"{__name__}:simplify", arguments, _REMEDY, progress, writes=folder)
-        return compact(RawMesh(*read_mesh_ply(folder / _SIMPLE)))
+        simple = compact(RawMesh(*read_mesh_ply(folder / _SIMPLE)))
     finally:
         _remove(folder, _CUT, _SIMPLE)
+    return with_long_rims(simple, _RIM_ERRORS * error_m)
 
 
 def simplify(arguments: Mapping[str, Any], progress: Progress) -> None:

@@ -35,6 +35,7 @@ from pipelines.surface.mesh import (
     vertex_normals,
     without_islands,
 )
+from pipelines.surface.mesh_rims import border_of, with_long_rims
 from pipelines.surface.poisson import (
     MeasuredPoints,
     certain_points,
@@ -226,6 +227,28 @@ def test_steps_of_a_border_are_no_edges_of_the_simplified_mesh(tmp_path: Path) -
     off = (20 + slope * simple.vertices[:, 0] - simple.vertices[:, 1]) / np.hypot(1, slope)
     assert off.min() > -0.5  # beyond the line, by a part of a cell
     assert distances(stepped.vertices, simple, 1.0).max() < 1.5
+
+
+@pytest.mark.parametrize(("wave_m", "least", "most"), [(0.2, 8, 24), (2.0, 60, 120)])
+def test_borders_lose_vertices_within_a_tolerance(wave_m: float, least: int, most: int) -> None:
+    """A square with a square hole, whose sides wave: those straight within the tolerance need their ends alone."""
+    side = 60
+    column, row = (axis.ravel().astype(float) for axis in np.meshgrid(np.arange(side), np.arange(side)))
+    first = np.flatnonzero((column < side - 1) & (row < side - 1))
+    corners = np.stack([first, first + 1, first + side, first + side + 1], axis=1)
+    hole = ((np.abs(column[corners] - 30) < 8) & (np.abs(row[corners] - 30) < 8)).any(axis=1)
+    corners = corners[~hole]
+    faces = np.concatenate([corners[:, [0, 1, 2]], corners[:, [1, 3, 2]]])
+    waves = wave_m / 2 * np.sin(0.9 * column)
+    mesh = compact(RawMesh(np.column_stack([column, row + 0.1 * waves, waves]), faces))
+    found = with_long_rims(mesh, 0.25)
+    _, count = edges_of(found.faces)
+    assert count.max() == 2
+    assert least <= (count == 1).sum() <= most < len(border_of(mesh)) / 2
+    assert len(holes_of(found)) == 1
+    assert (vertex_normals(found)[:, 2] > 0).all()  # no face has turned over
+    border = np.unique(border_of(mesh))
+    assert distances(mesh.vertices[border], found, 0.1).max() <= 0.25 + 1e-9
 
 
 def test_simplification_keeps_its_error(tmp_path: Path) -> None:
