@@ -16,8 +16,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from playwright.sync_api import Page
+from viewing import pages_camera, split
 
-from examples.benchmarks.viewing import pages_camera, split
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.splat import codec_arrays
 from pipelines.formats.spz import write_spz

@@ -40,8 +40,8 @@ class InputMarker:
     """Mark of a path whose content decides the stage's result: its fingerprint enters the manifest.
 
     In a folder, files with the suffixes, in lower case, count; without any, all do. With `only`, the files at these
-    places in the folder count, as far as there are any. Files `beside` a file count with it: by its suffix, in lower
-    case, patterns in its folder.
+    places in the folder count, as far as there are any. Files `beside` a file count with it: by its suffix, in
+    lower case, patterns in its folder.
     """
 
     suffixes: frozenset[str] = frozenset()
