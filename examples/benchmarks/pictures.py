@@ -175,7 +175,7 @@ class _Photographs:
         # Both pixel and cell are boxes, of a variance of a twelfth of their squared width.
         variance = ((cell_m / pixel_m) ** 2 - 1) / 12
         if variance > 0.01:
-            photo = cv2.GaussianBlur(photo, (0, 0), variance**0.5)
+            photo = cv2.GaussianBlur(photo, (0, 0), variance**0.5).astype(np.uint8)
         rgb = self._images.sampled(camera, photo, pixel.reshape(*shape, 2).astype(np.float32)).astype(np.float64)
         exposure = trained.model.cameras[camera].exposure
         if exposure is not None:
