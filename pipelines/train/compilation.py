@@ -38,18 +38,25 @@ def start_compilation() -> None:
 
 
 def compile_in_child(_arguments: Mapping[str, Any], progress: Progress) -> None:
-    """Compile as `compile_kernels`, at the priority of a training that may wait for it: task of `core.child`."""
-    compile_kernels(progress)
+    """Compile as `compile_kernels`, at the priority of a training that may wait for it: task of `core.child`.
+
+    Where another process compiles already, it does so for this one too.
+    """
+    with suppress(WorkspaceBusyError):
+        compile_kernels(progress, patience_s=0.0)
 
 
-def compile_kernels(progress: Progress = SILENT, *, renders: bool = True) -> None:
+def compile_kernels(progress: Progress = SILENT, *, renders: bool = True, patience_s: float = _PATIENCE_S) -> None:
     """Compile the kernels of stereo and rendering that the user's cache lacks, and load the others.
 
     Without `renders` those of stereo only: another backend than that of the CPU renders. One process
     compiles at a time: the others wait, and load what it has compiled.
+
+    Raises:
+        WorkspaceBusyError: another process compiles, and there is no patience.
     """
     steps = {"stereo": _match, "rendering": _render} if renders else {"stereo": _match}
-    with progress.task("kernels, compiled once", len(steps)) as task, _only_one():
+    with progress.task("kernels, compiled once", len(steps)) as task, _only_one(patience_s):
         for name, step in steps.items():
             step()
             task.advance(note=name)
@@ -61,10 +68,15 @@ def compile_kernels(progress: Progress = SILENT, *, renders: bool = True) -> Non
 
 
 @contextmanager
-def _only_one() -> Iterator[None]:
+def _only_one(patience_s: float) -> Iterator[None]:
     with ExitStack() as stack:
-        with suppress(InputError, WorkspaceBusyError):  # Without a cache each process compiles for itself.
-            stack.enter_context(WriteLock(cache_folder()).hold("the compilation of kernels", _PATIENCE_S))
+        try:
+            stack.enter_context(WriteLock(cache_folder()).hold("the compilation of kernels", patience_s))
+        except InputError:
+            pass  # Without a cache each process compiles for itself.
+        except WorkspaceBusyError:
+            if patience_s == 0.0:
+                raise
         yield
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.core.lock import WriteLock
+from pipelines.core.progress import SILENT
 from pipelines.splat import kernel_cache
 from pipelines.train import compilation
 
@@ -105,3 +107,17 @@ def test_compilation_of_all_kernels_leaves_a_stamp(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(compilation, "_render", lambda: None)
     compilation.compile_kernels()
     assert stamp.is_file() and tmp_path in stamp.parents
+
+
+def test_a_child_beside_another_compilation_ends_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each run of a batch starts one: those beside the first would only wait for it."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    kernel_cache._digest.cache_clear()
+    steps: list[str] = []
+    monkeypatch.setattr(compilation, "_match", lambda: steps.append("stereo"))
+    monkeypatch.setattr(compilation, "_render", lambda: steps.append("rendering"))
+    with WriteLock(kernel_cache.cache_folder()).hold("the compilation of kernels"):
+        compilation.compile_in_child({}, SILENT)
+        assert steps == []
+    compilation.compile_in_child({}, SILENT)
+    assert steps == ["stereo", "rendering"]
