@@ -15,7 +15,7 @@ from tests.scripts import REPOSITORY, load_script
 
 real_flights = load_script(REPOSITORY / "examples/flights/real_flights.py")
 
-RUN = real_flights.Run(seconds=90.0, peak_mb=2345.0, error="", at="2026-11-27")
+RUN = real_flights.Run(peak_mb=2345.0, error="", at="2026-11-27")
 
 
 def _flight(name: str, **values: str) -> object:
@@ -29,13 +29,15 @@ def test_table_and_page_say_what_the_products_say(finished: Workspace, tmp_path:
     cells = real_flights.row_of(flight, RUN, finished.root).strip("| ").split(" | ")
     values = Manifest.model_validate_json(finished.path("sfm/manifest.json").read_bytes()).values
     report = read_report(finished.path("evaluate/report.json"))
-    assert cells[1:4] == [f"{values['registered']} of {values['images']}", "1.5 min", "2.3 GB"]
+    made = [Manifest.model_validate_json(path.read_bytes()) for path in finished.root.glob("*/manifest.json")]
+    minutes = sum(manifest.duration_s for manifest in made) / 60
+    assert cells[1:4] == [f"{values['registered']} of {values['images']}", f"{minutes:.1f} min", "2.3 GB"]
     assert cells[4].startswith(report.headline.of_points)
     assert report.test_views is not None and cells[5] == f"{report.test_views.psnr_covered:.1f} dB"
     assert re.fullmatch(r"\d+ % of \d+\.\d\d ha", cells[6])
 
     arguments = argparse.Namespace(preset="smoke", out=out)
-    failed = real_flights.Run(3.0, 100.0, "/home/me/photos/a.jpg: is no photograph", "2026-11-27")
+    failed = real_flights.Run(100.0, "/home/me/photos/a.jpg: is no photograph", "2026-11-27")
     page = real_flights.page_of([(flight, RUN), (_flight("gone"), failed)], [_flight("x")], arguments, tmp_path)
     assert f"| [A flight](#{flight.name}) |" in page and "**Failed**: a.jpg: is no photograph" in page
     assert re.search(r"\[A flight\]\(#gone\) \| – \|.*\| failed \|", page)

@@ -4,8 +4,8 @@
     real_flights.py DATA OUT --page docs      write docs/real_flights.md and its thumbnails, failures included
 
 The photographs are downloaded by you, from the addresses in flights.toml. Each flight is a workspace in OUT, run at
-one preset with its rasters and report; what stands there already is not made again, and its time and memory are
-those of the run that made it. A flight that fails has its error in the table.
+one preset with its rasters and report; what stands there already is not made again. Its time is the sum of its
+stages' times, its memory that of the run that ended it. A flight that fails has its error in the table.
 """
 
 from __future__ import annotations
@@ -62,7 +62,6 @@ class Flight:
 class Run:
     """What one run of `georef` came to; `error` is its last message, empty where it ended well."""
 
-    seconds: float
     peak_mb: float
     error: str
     at: str
@@ -111,19 +110,17 @@ def run_flight(flight: Flight, data: Path, out: Path, preset: str) -> Run:
             f"{flight.name}: other photographs than those of the published figures ({found[:12]}…)", file=sys.stderr
         )
     out.mkdir(parents=True, exist_ok=True)
-    started, clock = time.strftime("%Y-%m-%d"), time.perf_counter()
+    started, before = time.strftime("%Y-%m-%d"), record_of(workspace)
     with (out / f"{flight.name}.log").open("w", encoding="utf-8") as log:
         process = subprocess.Popen([sys.executable, "-m", "georef_cli", *words], stdout=log, stderr=log, cwd=ROOT)
         _, status, usage = os.wait4(process.pid, 0)
-    seconds = time.perf_counter() - clock
     said = (out / f"{flight.name}.log").read_text("utf-8")
     error = (
         "" if os.waitstatus_to_exitcode(status) == 0 else (re.findall(r"(?m)^error: .*", said) or [said[-300:]])[-1]
     )
-    run = Run(seconds, usage.ru_maxrss / 1024, error.removeprefix("error: "), started)
-    before = record_of(workspace)
-    if before is not None and not before.error and not run.error and seconds < before.seconds / 4:
-        return before  # Nothing was left to do.
+    run = Run(usage.ru_maxrss / 1024, error.removeprefix("error: "), started)
+    if before is not None and not before.error and not run.error and run.peak_mb < before.peak_mb:
+        return before  # Little was left to do.
     record_file(workspace).write_text(json.dumps(asdict(run)), encoding="utf-8")
     return run
 
@@ -176,9 +173,14 @@ def is_made(folder: Path) -> bool:
 def row_of(flight: Flight, run: Run, workspace: Path) -> str:
     """Return a flight's line of the table, in Markdown."""
     figures = figures_of(workspace)
-    cells = [f"[{flight.title}](#{flight.name})", registered(figures), f"{run.seconds / 60:.1f} min"]
+    cells = [f"[{flight.title}](#{flight.name})", registered(figures), f"{minutes(figures):.1f} min"]
     cells += [f"{run.peak_mb / 1000:.1f} GB", accuracy(figures), quality(figures), measured(figures)]
     return "| " + " | ".join([*cells, "failed" if run.error else str(len(remarks(figures)))]) + " |"
+
+
+def minutes(figures: Figures) -> float:
+    """Return the time of all stages in minutes."""
+    return sum(manifest.duration_s for manifest in figures.manifests.values()) / 60
 
 
 def registered(figures: Figures) -> str:
