@@ -10,7 +10,12 @@ from pipelines.core.products import ArrayProduct, Product, Remark
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.similarity import SimilarityRecord
 from pipelines.robust.statistics import ResidualStats
-from pipelines.survey.report_parts import VarianceFactor, applied_factors, with_variance_factors
+from pipelines.survey.report_parts import (
+    VarianceFactor,
+    applied_factors,
+    factor_of_check_points,
+    with_variance_factors,
+)
 from pipelines.survey.survey import Survey
 
 
@@ -45,7 +50,9 @@ class InitialSimilarity(Product):
 
     def weighted(self, survey: Survey) -> Survey:
         """Return a survey with the applied variance factors in its covariances."""
-        return with_variance_factors(survey, applied_factors(self.variance_factors))
+        factors = self.variance_factors
+        of_checks = factor_of_check_points(factors)
+        return with_variance_factors(survey, applied_factors(factors), of_assumed_checks=of_checks)
 
     def rejected(self, survey: Survey) -> Survey | None:
         """Return a survey with the rejected measurements alone; None: there are none."""

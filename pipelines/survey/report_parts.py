@@ -207,11 +207,20 @@ def applied_factors(factors: tuple[VarianceFactor, ...]) -> dict[Group, float]:
     return {factor.group: factor.applied for factor in factors if factor.applied != 1.0}
 
 
-def with_variance_factors(survey: Survey, applied: dict[Group, float]) -> Survey:
+def factor_of_check_points(factors: tuple[VarianceFactor, ...]) -> float:
+    """Return the factor of check points whose σ nobody stated: that of control points by the same assumption.
+
+    A factor below 1 says how well the solution fits its control, and nothing of points that it does not know.
+    """
+    control = next((factor for factor in factors if factor.group == "control points"), None)
+    return max(control.applied, 1.0) if control is not None and control.sigma_source == "default" else 1.0
+
+
+def with_variance_factors(survey: Survey, applied: dict[Group, float], *, of_assumed_checks: float = 1.0) -> Survey:
     """Return the survey with the covariances of each group multiplied by its factor.
 
     The σ of marks applies to check points too: the same person marks both. The surveyed positions of the check
-    points keep their covariance.
+    points keep their covariance; those with the σ of the control points get the factor `of_assumed_checks`.
     """
     if not applied:
         return survey
@@ -223,7 +232,10 @@ def with_variance_factors(survey: Survey, applied: dict[Group, float]) -> Survey
             "control_points": tuple(
                 _point(point, applied.get("control points", 1.0), of_marks) for point in survey.control_points
             ),
-            "check_points": tuple(_point(point, 1.0, of_marks) for point in survey.check_points),
+            "check_points": tuple(
+                _point(point, of_assumed_checks if _has_sigma_of(point, survey.control_points) else 1.0, of_marks)
+                for point in survey.check_points
+            ),
         }
     )
 
@@ -254,6 +266,11 @@ def _session(session: FixSession, applied: dict[Group, float]) -> FixSession:
 def _point(point: SurveyedPoint, of_survey: float, of_marks: float) -> SurveyedPoint:
     marks = tuple(mark.model_copy(update={"sigma_px": mark.sigma_px * of_marks**0.5}) for mark in point.marks)
     return point.model_copy(update={"cov_in_geo": _scaled(point.cov_in_geo, of_survey), "marks": marks})
+
+
+def _has_sigma_of(point: SurveyedPoint, others: tuple[SurveyedPoint, ...]) -> bool:
+    """Return whether a point has the σ of one of the others, but for the turn of the vertical between them."""
+    return any(np.allclose(point.cov_in_geo, other.cov_in_geo, rtol=1e-3, atol=1e-9) for other in others)
 
 
 def _scaled(covariance: Covariance3, factor: float) -> Matrix3:
