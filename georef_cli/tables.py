@@ -137,9 +137,10 @@ def _cameras(rows: Sequence[Mapping[str, Any]]) -> list[Renderable]:
         "focal px": [f"{row['focal_px']:.1f}" for row in rows],
         "from": [shown(row["focal_source"]) for row in rows],
         "images": [str(row["images"]) for row in rows],
+        "least sharp": ["" if row.get("least_sharp") is None else f"{row['least_sharp']:.2f}" for row in rows],
     }
     columns = {head: cells for head, cells in columns.items() if any(cells)}
-    numbers = [place for place, head in enumerate(columns) if head in ("focal px", "images")]
+    numbers = [place for place, head in enumerate(columns) if head in ("focal px", "images", "least sharp")]
     table = plain_table(*columns, right=numbers)
     for row in zip(*columns.values(), strict=True):
         table.add_row(*row)

@@ -330,14 +330,6 @@ class ImageWriter:
         return _to_bgr(raw, encoding)
 
 
-def sharpness(data: bytes) -> float:
-    """Return the variance of the Laplacian of an encoded image at a quarter of its size: low for blurred images."""
-    import cv2
-
-    grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_4)
-    return 0.0 if grey is None else float(cv2.Laplacian(grey, cv2.CV_64F).var())
-
-
 def _compressed(message: Any) -> tuple[bytes, str]:
     data = np.asarray(message.data, dtype=np.uint8).tobytes()
     if len(data) > MAX_BYTES:

@@ -10,17 +10,16 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray
-from pipelines.formats.bag import BadImageError, Bag, ImageWriter, UndecodableError, sharpness
+from pipelines.formats.bag import BadImageError, Bag, ImageWriter, UndecodableError
 from pipelines.formats.exif import PhotoTags
 from pipelines.formats.image_file import MAX_PIXELS, inspect_image
 from pipelines.ingest.bag_streams import BagStreams, TopicSamples
 from pipelines.ingest.options import Every, IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors
 from pipelines.ingest.remarks import Remarks
+from pipelines.ingest.stray_pictures import BLURRED
 from pipelines.survey.survey import CameraPrior
 
-# A frame is blurred if it is less than half as sharp as the frames around it.
-_BLURRED = 0.5
 _NEIGHBOURS = 15
 _LEAST_NEIGHBOURS = 3
 _STEP_SLACK_S = 1e-6
@@ -63,7 +62,7 @@ def write_photos(
             except (UndecodableError, BadImageError, InputError) as error:
                 failed.append(f"message {number} ({str(error)[:120]})")
                 continue
-            if options.skip_blurred and _is_blurred(data, recent):
+            if options.skip_blurred and _is_blurred(file.sharpness, recent):
                 blurred += 1
                 continue
             if file.sha256 in hashes:
@@ -94,12 +93,11 @@ def _is_due(every: Every, time_s: FloatArray, place: FloatArray, last: int | Non
     return last is None or bool(np.linalg.norm(place[number] - place[last]) >= every.step)
 
 
-def _is_blurred(data: bytes, recent: deque[float]) -> bool:
+def _is_blurred(current: float, recent: deque[float]) -> bool:
     """Return whether a frame is blurred against those before it, taken or not, so that a dull scene is not."""
-    current = sharpness(data)
     usual = float(np.median(recent)) if len(recent) >= _LEAST_NEIGHBOURS else 0.0
     recent.append(current)
-    return current < _BLURRED * usual
+    return current < BLURRED * usual
 
 
 def lens_priors(

@@ -28,7 +28,12 @@ from pipelines.ingest.photo_times import with_times
 from pipelines.ingest.reference_system import is_projected
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.sensors import chosen_sensor, with_sensors
-from pipelines.ingest.stray_pictures import without_panoramas, without_reduced_copies
+from pipelines.ingest.stray_pictures import (
+    with_sharpness,
+    without_blurred,
+    without_panoramas,
+    without_reduced_copies,
+)
 from pipelines.ingest.table_poses import poses_from_table
 from pipelines.ingest.tag_contents import note_repeats, note_tags
 
@@ -55,7 +60,8 @@ def read_folder(
     """
     photos = without_panoramas(scan_folder(folder, remarks, progress, decode=decode), remarks)
     photos = without_reduced_copies(with_sensors(photos), remarks)
-    photos = chosen_sensor(photos, options.sensor, remarks) if photos else photos
+    photos = with_sharpness(chosen_sensor(photos, options.sensor, remarks) if photos else photos)
+    photos = without_blurred(photos, remarks) if options.skip_blurred else photos
     flight_record.require_enough(len(photos), folder, "--images", remarks)
     photos = with_times(photos, remarks)
     note_tags(photos, remarks)

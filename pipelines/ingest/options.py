@@ -102,7 +102,10 @@ class IngestOptions(StageOptions):
         None,
         description="Take a frame of the bag every 2s, or every 5m flown (default: all); of a video, every 2s.",
     )
-    skip_blurred: bool = Field(False, description="Leave out blurred frames of the bag.")
+    skip_blurred: bool = Field(
+        False,
+        description="Leave out photographs, and frames of a bag, that are less than half as sharp as those around.",
+    )
     ground_height: float | None = Field(
         None,
         description="Height of the terrain in metres, above the datum of --vertical, else the ellipsoid: cameras "

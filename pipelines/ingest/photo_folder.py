@@ -39,13 +39,15 @@ from pipelines.survey.survey import CameraPrior
 class Photo:
     """A usable photograph; `name` is relative to its folder, with forward slashes.
 
-    `sensor` is that of `ingest.sensors`, empty where nothing tells one.
+    `sensor` is that of `ingest.sensors`, empty where nothing tells one. `sharpness` is over that of the photographs
+    around it, None where nothing tells it.
     """
 
     name: str
     file: ImageFile
     tags: PhotoTags
     sensor: str = ""
+    sharpness: float | None = None
 
 
 def scan_folder(root: Path, remarks: Remarks, progress: Progress = SILENT, *, decode: bool = True) -> list[Photo]:

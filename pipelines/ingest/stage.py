@@ -175,8 +175,12 @@ def _copy_images(survey: Survey, stage: StageRun) -> None:
 
 
 def _camera_list(survey: Survey) -> list[dict[str, Any]]:
-    """Return the cameras of a survey: model, serial number, sensor, size, focal length, photographs."""
+    """Return the cameras of a survey: model, serial number, sensor, size, focal length, photographs, sharpness."""
     images = Counter(image.camera_id for image in survey.images)
+    sharp: dict[int, list[float]] = {}
+    for image in survey.images:
+        if image.sharpness is not None:
+            sharp.setdefault(image.camera_id, []).append(image.sharpness)
     return [
         {
             "camera_id": camera.camera_id,
@@ -189,6 +193,7 @@ def _camera_list(survey: Survey) -> list[dict[str, Any]]:
             "focal_px": round(camera.params[0], 1),
             "focal_source": camera.focal_source,
             "images": images[camera.camera_id],
+            "least_sharp": min(sharp[camera.camera_id]) if camera.camera_id in sharp else None,
         }
         for camera in survey.cameras
     ]

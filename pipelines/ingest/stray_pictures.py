@@ -1,4 +1,4 @@
-"""Pictures in a folder of photographs that are none of the survey: thumbnails, reduced copies, panoramas.
+"""Pictures in a folder of photographs that are none of the survey: reduced copies, panoramas, blurred ones.
 
 Servers, viewers and other programs leave them beside the photographs, with the tags of these. Left out by name.
 """
@@ -6,6 +6,7 @@ Servers, viewers and other programs leave them beside the photographs, with the 
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -23,6 +24,44 @@ _FLAT = frozenset({"perspective", "rectilinear", "fisheye", "planar"})  # projec
 _SAME, _SURE, _SAME_SIZE = 0.7, 0.95, 0.98  # correlations of two pictures
 _SAME_PLACE_DEG = 1e-6  # a tenth of a metre: programs write fractions anew
 _PLAIN = 2.0  # σ of the grey values of a picture that shows nothing to compare
+
+
+BLURRED = 0.5  # of the sharpness of the pictures around: a blurred one has less
+_AROUND, _LEAST_AROUND = 4, 3  # photographs before and after, by which sharpness is judged
+
+
+def with_sharpness(photos: Sequence[Photo]) -> list[Photo]:
+    """Return the photographs with their sharpness over that of those around in time, of the same camera.
+
+    Forest, fields and water differ by more than blur does, but not from one photograph to the next. Of the medians
+    before and after a photograph the lower one counts: the first one of a lake is as sharp as the next.
+    """
+    relative: dict[str, float] = {}
+    cameras: dict[object, list[Photo]] = {}
+    for photo in photos:
+        kind = (photo.file.width, photo.file.height, photo.tags.make_model, photo.sensor)
+        cameras.setdefault(kind, []).append(photo)
+    for members in cameras.values():
+        timed = all(photo.tags.timestamp_s is not None for photo in members)
+        known = [photo for photo in members if photo.file.sharpness > 0.0]
+        known.sort(key=lambda photo: (photo.tags.timestamp_s or 0.0) if timed else 0.0)  # else by name, as they are
+        for place, photo in enumerate(known):
+            sides = known[max(place - _AROUND, 0) : place], known[place + 1 : place + 1 + _AROUND]
+            if sum(map(len, sides)) >= _LEAST_AROUND:
+                usual = min(np.median([one.file.sharpness for one in side]) for side in sides if side)
+                relative[photo.name] = float(photo.file.sharpness / usual)
+    return [replace(photo, sharpness=relative.get(photo.name)) for photo in photos]
+
+
+def without_blurred(photos: Sequence[Photo], remarks: Remarks) -> list[Photo]:
+    """Return the photographs without those that are less than half as sharp as the ones around."""
+    blurred = {photo.name: photo.sharpness for photo in photos if (photo.sharpness or 1.0) < BLURRED}
+    remarks.warn_counted(
+        "photographs-blurred",
+        [f"{name} ({share:.2f})" for name, share in blurred.items()],
+        f"Photographs have less than {BLURRED:g} of the sharpness of those around, and are left out",
+    )
+    return [photo for photo in photos if photo.name not in blurred]
 
 
 def without_panoramas(photos: Sequence[Photo], remarks: Remarks) -> list[Photo]:

@@ -207,6 +207,7 @@ def _images(
             fix=fixes[row],
             attitude=attitudes[row],
             split="test" if row in test else "train",
+            sharpness=None if photo.sharpness is None else round(photo.sharpness, 3),
         )
         for row, photo in enumerate(flight.photos)
     )

@@ -273,7 +273,8 @@ class SurveyImage(Product):
     """Photograph, named by its path relative to the survey's `image_dir`; its time is the camera clock's.
 
     `sha256` is empty in a survey written by hand: the photograph is not checked then. `mask_sha256` is the hash of
-    `ingest/masks/NAME.png`, where black pixels are left out; empty: all pixels count.
+    `ingest/masks/NAME.png`, where black pixels are left out; empty: all pixels count. `sharpness` is over that of
+    the photographs around it, None where nothing tells it.
     """
 
     name: ImageName
@@ -285,6 +286,7 @@ class SurveyImage(Product):
     velocity_in_geo: Vector3 | None = None  # of a camera with a rolling shutter, m/s
     mask_sha256: str = ""
     split: Literal["train", "test"] = "train"
+    sharpness: float | None = None
 
 
 class Mark(Product):

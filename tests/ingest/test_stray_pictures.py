@@ -182,3 +182,46 @@ def test_a_folder_of_panoramas_is_refused(tmp_path: Path) -> None:
         write(tmp_path / f"photos/R{number}.JPG", picture(number, (120, 60)), exif(number, "RICOH THETA Z1"))
     with refused("only-panoramas", InputError):
         ingest(tmp_path / "photos")
+
+
+def detailed(number: int, contrast: float) -> np.ndarray:
+    """A scene with detail of all scales, forest (contrast 40) or water (4)."""
+    rng, pixels = np.random.default_rng(number), np.zeros((480, 640))
+    for scale in (2, 4, 8, 16):
+        pixels += cv2.resize(rng.normal(size=(480 // scale, 640 // scale)), (640, 480))
+    return np.asarray(np.clip(120 + contrast / 2 * pixels, 0, 255).astype(np.uint8))
+
+
+def moved(pixels: np.ndarray, by_px: int) -> np.ndarray:
+    """As a camera that moves during the exposure sees it."""
+    return np.asarray(cv2.blur(pixels, (by_px, 1)))
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
+def test_blurred_photographs_are_left_out_on_request(tmp_path: Path, suffix: str) -> None:
+    """Moved by 40 px, and out of focus; a lake between forests is no blur, nor are 6 px of motion."""
+    for number in range(16):
+        pixels = detailed(number, 4.0 if 5 <= number < 11 else 40.0)
+        pixels = moved(pixels, {2: 40, 13: 6}.get(number, 1))
+        pixels = cv2.GaussianBlur(pixels, (0, 0), 12.0) if number == 7 else pixels
+        path = tmp_path / f"photos/IMG_{number:02d}.{suffix}"
+        if suffix == "jpg":
+            write(path, pixels, exif(number), quality=95)
+        else:
+            path.parent.mkdir(exist_ok=True)
+            cv2.imwrite(str(path), pixels.astype(np.uint16) * 257 if suffix == "png" else pixels)
+    positions = "".join(f"IMG_{n:02d}.{suffix},46.0,{7 + 1e-4 * n:.6f},500\n" for n in range(16))
+    (tmp_path / "fixes.csv").write_text("image,lat,lon,alt\n" + positions)
+    options = {"trajectory": tmp_path / "fixes.csv"} if suffix != "jpg" else {}
+    every = ingest(tmp_path / "photos", **options)
+    assert len(every.images) == 16 and "photographs-blurred" not in codes(every.warnings)
+    sharpness = {image.name: image.sharpness for image in every.images}
+    assert {name for name, value in sharpness.items() if value is not None and value < 0.5} == {
+        f"IMG_{number:02d}.{suffix}" for number in (2, 7)
+    }
+    sharp = ingest(tmp_path / "photos", skip_blurred=True, **options)
+    names = {image.name for image in every.images} - {image.name for image in sharp.images}
+    assert names == {f"IMG_02.{suffix}", f"IMG_07.{suffix}"}
+    assert "(2)" in said(sharp.warnings, "photographs-blurred") and "IMG_02" in said(
+        sharp.warnings, "photographs-blurred"
+    )
