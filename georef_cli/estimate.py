@@ -63,13 +63,14 @@ class RunEstimate:
     modelled: Mapping[str, float]  # the same, before this machine's own runs correct it
     reconstruction: ReconstructionEstimate | None  # None where none would run, or before a bag is read
     training: TrainingEstimate | None  # likewise
+    compilation_s: float = 0.0  # by which the training is later on a machine that has to compile its kernels
 
     @property
     def total_s(self) -> float | None:
         """Seconds of the whole run; None: not known, as of a bag that is not read yet or of a training on a GPU."""
         going = [row.stage for row in self.planned if row.works]
         known = [seconds for stage in going if (seconds := self.seconds.get(stage)) is not None]
-        return sum(known) if len(known) == len(going) else None
+        return sum(known) + self.compilation_s if len(known) == len(going) else None
 
     @property
     def peak_bytes(self) -> int:
@@ -96,6 +97,7 @@ def estimate_run(
 ) -> RunEstimate:
     """Return the estimate of a run, as of `plan`; nothing is written. A GeorefError: the run would be refused."""
     from pipelines.sfm.reconstructor import reconstructor_of
+    from pipelines.train.compilation import compilation_s
     from pipelines.train.estimate import estimate_training
 
     planned = plan(workspace, stages, flags, force=force)
@@ -129,7 +131,8 @@ def estimate_run(
             if row.works and rough is not None:
                 modelled[row.stage] = rough
     seconds |= {name: pace.corrected(name, value) for name, value in modelled.items()}
-    return RunEstimate(planned, photographs, seconds, modelled, reconstruction, training)
+    once_s = 0.0 if training is None or training.refusal else compilation_s()
+    return RunEstimate(planned, photographs, seconds, modelled, reconstruction, training, once_s)
 
 
 def checked_inputs(
@@ -218,6 +221,8 @@ def print_dry_run(
         parts += ["\n[bold]Reconstruction[/]", *(f"  {shown(text)}" for text in run.reconstruction.sentences())]
     if run.training is not None:
         parts += ["\n[bold]Training[/]", *(f"  {shown(text)}" for text in run.training.sentences())]
+    if run.compilation_s:
+        parts.append(f"  about {about(run.compilation_s)} more, once: this machine compiles the kernels")
     if run.photographs is not None:
         time_text = "not measured" if run.total_s is None else f"about {about(run.total_s)}"
         memory = f"; memory about {size(run.peak_bytes)}" if run.peak_bytes else ""
@@ -250,6 +255,8 @@ def keep_times(run: RunEstimate | None, outcomes: Sequence[Outcome], before: pac
         log.info("run: others used %.0f %% of this machine: its times are not kept for estimates.", 100 * share)
         return
     whole = {row.stage for row in run.planned if row.action in ("run", "perhaps")}
+    if run.compilation_s:  # beside the one, before the other
+        whole -= {"sfm", "train"}
     for outcome in outcomes:
         if outcome.ran and outcome.stage in whole:
             pace.learn(outcome.stage, run.modelled.get(outcome.stage), outcome.manifest.duration_s)
@@ -299,7 +306,12 @@ def _document(workspace: Workspace, run: RunEstimate, survey: Summary | None) ->
         "photographs": run.photographs and dataclasses.asdict(run.photographs),
         "reconstruction": run.reconstruction and dataclasses.asdict(run.reconstruction),
         "training": run.training and dataclasses.asdict(run.training),
-        "total": {"seconds": run.total_s, "peak_bytes": run.peak_bytes, "disk_bytes": run.disk_bytes},
+        "total": {
+            "seconds": run.total_s,
+            "compilation_seconds": run.compilation_s,
+            "peak_bytes": run.peak_bytes,
+            "disk_bytes": run.disk_bytes,
+        },
     }
 
 

@@ -77,8 +77,10 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         message = f"No cell is seen by {options.min_views} training views or more. Lower --min-views."
         raise DegenerateGeometryError("no-raster-cells", message)
     sidecar = _sidecar(stage, trained, mosaic, source, height, options=options, no_sigma=reason)
-    for path in mosaic.write(stage.out, sidecar, stage.progress):
-        write_sidecar(sidecar, path)
+    terrain = sidecar if source.terrain is None else _sidecar_of_terrain(sidecar, mosaic)
+    sidecars = {"dtm": terrain, "sigma_dtm": terrain}
+    for path, own in mosaic.write(stage.out, lambda name: sidecars.get(name, sidecar), stage.progress):
+        write_sidecar(own, path)
     holes = mosaic.interpolated_parts(stage.out / "measured.tif")
     replace_text(stage.out / "interpolated.geojson", features_text(holes))
     height_colours = None
@@ -146,7 +148,10 @@ def _sidecar(
     options: ExportRasterOptions,
     no_sigma: str,
 ) -> CrsSidecar:
-    """Return the sidecar of all rasters, with heights (K,) of their cells; `no_sigma` says why σ is not known."""
+    """Return the sidecar of the rasters of the surface, with heights (K,) of their cells.
+
+    `no_sigma` says why σ is not known.
+    """
     sigma = None
     if not no_sigma:
         counts = "georeference, cameras and lens; the surface's own noise between training views; interpolation"
@@ -160,6 +165,19 @@ def _sidecar(
     empty = "The rasters state no σ, and sigma_h.tif and sigma_v.tif are empty"
     cautions = union(trained.model.cautions, (*coarse, *without_sigma(empty, no_sigma)))
     return source.target.sidecar(bounds, headline_of(stage.workspace), sigma, cautions)
+
+
+def _sidecar_of_terrain(sidecar: CrsSidecar, mosaic: Mosaic) -> CrsSidecar:
+    """Return the sidecar of the ground below the surface: its own heights, and the σ of where it is bridged."""
+    height, vertical_m = mosaic.sample("dtm"), mosaic.sample("sigma_dtm")
+    (west, south, _), (east, north, _) = bounds = sidecar.bounds
+    if len(height):
+        bounds = ((west, south, float(height.min())), (east, north, float(height.max())))
+    sigma = None
+    if sidecar.sigma is not None and len(vertical_m):
+        counts = f"{sidecar.sigma.counts}; the ground below houses and trees"
+        sigma = scene_sigma(counts, mosaic.sample("sigma_h"), vertical_m)
+    return sidecar.model_copy(update={"bounds": bounds, "sigma": sigma})
 
 
 def _write_contours(

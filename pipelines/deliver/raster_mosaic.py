@@ -1,6 +1,6 @@
 """Rasters of the stage, window by window: rendered into parts, made whole inside the area, then put together."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -271,25 +271,16 @@ class Mosaic:
             for part in parts
         ]
 
-    def write(self, folder: Path, sidecar: CrsSidecar, progress: Progress) -> Iterator[Path]:
-        """Write each raster into a folder, with accuracy and σ of the sidecar as metadata, and yield its path."""
-        tags = {
-            "TIFFTAG_SOFTWARE": f"GeoRefGS {__version__}",
-            "GEOREF_CRS": sidecar.crs,
-            "GEOREF_VERTICAL_DATUM": sidecar.vertical_datum.name,
-            "GEOREF_EPOCH": "not stated",
-        }
-        if sidecar.accuracy is not None:
-            tags["GEOREF_ACCURACY"] = sidecar.accuracy.text
-        if sidecar.sigma is not None:
-            tags["GEOREF_MEDIAN_CELL_SIGMA_H_M"] = f"{sidecar.sigma.median_sigma_h_m:.4f}"
-            tags["GEOREF_MEDIAN_CELL_SIGMA_V_M"] = f"{sidecar.sigma.median_sigma_v_m:.4f}"
+    def write(
+        self, folder: Path, sidecar_of: Callable[[str], CrsSidecar], progress: Progress
+    ) -> Iterator[tuple[Path, CrsSidecar]]:
+        """Write each raster into a folder, with accuracy and σ of its sidecar as metadata; yield both."""
         with progress.task("rasters", len(self._kinds)) as task:
             for name, kind in self._kinds.items():
                 parts = [(self._delivered(name, one), one.column, one.row) for one in self._windows()]
-                path = folder / f"{name}.tif"
-                write_mosaic(path, parts, self.frame, kind, tags)
-                yield path
+                path, sidecar = folder / f"{name}.tif", sidecar_of(name)
+                write_mosaic(path, parts, self.frame, kind, _tags(sidecar))
+                yield path, sidecar
                 task.advance(note=path.name)
 
     def _windows(self) -> Iterator[_Window]:
@@ -309,6 +300,21 @@ class Mosaic:
 
     def _part(self, folder: Path, name: str, window: _Window) -> Path:
         return folder / f"{name}_{window.row}_{window.column}.tif"
+
+
+def _tags(sidecar: CrsSidecar) -> dict[str, str]:
+    tags = {
+        "TIFFTAG_SOFTWARE": f"GeoRefGS {__version__}",
+        "GEOREF_CRS": sidecar.crs,
+        "GEOREF_VERTICAL_DATUM": sidecar.vertical_datum.name,
+        "GEOREF_EPOCH": "not stated",
+    }
+    if sidecar.accuracy is not None:
+        tags["GEOREF_ACCURACY"] = sidecar.accuracy.text
+    if sidecar.sigma is not None:
+        tags["GEOREF_MEDIAN_CELL_SIGMA_H_M"] = f"{sidecar.sigma.median_sigma_h_m:.4f}"
+        tags["GEOREF_MEDIAN_CELL_SIGMA_V_M"] = f"{sidecar.sigma.median_sigma_v_m:.4f}"
+    return tags
 
 
 def _coarse_cells(window: _Window, step: int) -> tuple[IntArray, IntArray]:

@@ -14,6 +14,7 @@ from pipelines.core.sentences import listed
 from pipelines.core.stages import BY_NAME, HILLSHADE, ORTHOPHOTO_PREVIEW
 from pipelines.core.workspace import Workspace
 from pipelines.report.cameras import LensesFacts
+from pipelines.report.delivered import measured_share
 from pipelines.report.options import ReportOptions
 from pipelines.report.page import (
     Picture,
@@ -24,6 +25,7 @@ from pipelines.report.page import (
     picture_of_png,
     preview,
     read_pixels,
+    share,
 )
 from pipelines.report.place import OverlapFacts
 from pipelines.report.plots.maps import RasterPlace, raster_map
@@ -62,7 +64,10 @@ def cover_facts(
     """Return the cover; an InputError: the logo is no PNG or JPEG, or too large."""
     survey, crs, report = evaluated.solved.survey, evaluated.crs, evaluated.report
     area = MISSING if report.area_ha is None else f"{number_text(report.area_ha, 2)} ha"
-    if report.area_measured is not None:
+    delivered = measured_share(evaluated.workspace)
+    if delivered is not None:  # what the list of delivered files says of the rasters
+        area = f"{number_text(delivered[1], 2)} ha, {share(delivered[0])} of it measured"
+    elif report.area_measured is not None:
         area += f", {report.area_measured:.0%} of it measured"
     surface = report.headline.surface
     height_m, gsd_m = flying_height_m(evaluated), ground_sampling_m(evaluated)

@@ -24,6 +24,7 @@ from pipelines.formats.geotiff import frame_of
 from pipelines.report.page import number_text, share
 
 _STAGES = ("export-ply", *(spec.name for spec in DELIVERABLES if spec.name != "report"))
+_DRAWN_OF = {"contours.gpkg": "dsm.tif", "contours.dxf": "dsm.tif"}  # in the CRS of that raster
 _SIDECARS: tuple[type[GeorefSidecar | CrsSidecar], ...] = (MeshCrsSidecar, CrsSidecar, MeshSidecar, GeorefSidecar)
 
 
@@ -79,6 +80,11 @@ def _values(workspace: Workspace, stage: str) -> dict[str, Any]:
 
 def _file(file: Path, path: str, description: str, values: dict[str, Any]) -> DeliveredFile:
     crs, heights, sigma = _place(file)
+    shares = _shares(values) if crs and path != "export/splat.ply" else ""
+    if file.name in _DRAWN_OF:  # it has no sidecar of its own
+        crs, heights, _ = _place(file.with_name(_DRAWN_OF[file.name]))
+    elif file.suffix == ".geojson":
+        crs = "longitude, latitude (WGS84)"
     inside = [each for each in file.rglob("*") if each.is_file()] if file.is_dir() else [file]
     return DeliveredFile(
         path=path,
@@ -86,7 +92,7 @@ def _file(file: Path, path: str, description: str, values: dict[str, Any]) -> De
         crs=crs,
         heights=heights,
         cell=_cell(file, values) if file.suffix == ".tif" else "",
-        shares=_shares(values) if crs and path != "export/splat.ply" else "",
+        shares=shares,
         sigma=sigma,
         bytes=sum(each.stat().st_size for each in inside),
         files=len(inside),

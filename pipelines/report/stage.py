@@ -102,8 +102,8 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             *([] if change is None else [Section("change", "Change", "change.html", change)]),
             Section("processing", "Appendix: processing", "record.html", record),
             Section("photographs", "Appendix: photographs", "photographs.html", cameras),
-            *training,
             Section("glossary", "Glossary", "glossary.html", bool(of_gaussians)),
+            *training,  # last: paper leaves it out, and shall not lack a number
         ),
         document=evaluated.report.model_dump(mode="json"),
     )

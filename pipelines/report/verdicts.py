@@ -4,6 +4,7 @@ Every rule is stated on the page. `unknown` is the verdict where nothing was mea
 """
 
 import math
+import statistics
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -12,7 +13,14 @@ from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.sentences import listed
 from pipelines.core.types import Vector3
 from pipelines.report.page import decibel, number_text, share
-from pipelines.survey.report import CheckPointErrors, DistanceError, EvaluationReport, PhotometricFigures
+from pipelines.survey.report import (
+    CheckPointErrors,
+    CheckPoints,
+    DistanceError,
+    EvaluationReport,
+    PhotometricFigures,
+    SurfaceHeight,
+)
 from pipelines.survey.report_parts import Group, VarianceFactor
 from pipelines.survey.survey import LOCAL_FRAME
 
@@ -71,6 +79,8 @@ _OF_CHECK_POINTS = {"prediction-rejected": "more", "prediction-pessimistic": "le
 
 _OF_FIXES: tuple[Group, ...] = ("fixes", "horizontal drift", "vertical drift")
 _SCATTER = 2.25  # variance factor, of σ that are larger by one half
+_HEIGHT_OFF, _LEAST_HEIGHTS = 6.0, 5  # robust σ of the heights, and points that have one
+_ROBUST = 1.4826  # σ of normal errors over the median of their sizes
 _SMALL = 0.25  # variance factor, below which residuals are less than half of σ
 
 _Fields = tuple[Level, str, str, str]  # of a verdict without its subject, in their order
@@ -89,7 +99,7 @@ def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Re
         "Check points": _check_points(measured, triangulated),
         "Predicted against measured": _prediction(triangulated, codes),
         "Blunders": _blunders(triangulated),
-        **({} if on_surface is None else {"Surface at the points": _surface(on_surface, triangulated)}),
+        **({} if on_surface is None else {"Surface at the points": _surface(report.checkpoints, on_surface)}),
     }
     by_subject: dict[str, _Fields] = {
         "Registered photographs": _registered(measured),
@@ -303,22 +313,39 @@ def _blunders(errors: CheckPointErrors) -> _Fields:
     return "good", "none", "no triangulated check point stands out", rule
 
 
-def _surface(errors: CheckPointErrors, triangulated: CheckPointErrors) -> _Fields:
-    """Return the verdict on the surface; a point that surface and triangulation miss alike does not accuse it."""
-    rule = "good if no check point is a blunder on the rendered surface, fair up to a fifth of them, poor beyond"
+def _surface(points: CheckPoints, errors: CheckPointErrors) -> _Fields:
+    """Return the verdict on the surface, behind the marks and from above.
+
+    A point that surface and triangulation miss alike does not accuse it.
+    """
+    rule = (
+        "good if no check point is a blunder on the rendered surface, nor further below or above it than "
+        f"{_HEIGHT_OFF:g} robust σ of all of them, fair up to a fifth, poor beyond"
+    )
     if not errors.count:
         return "unknown", "no check points", "nothing to compare with", rule
+    triangulated = points.triangulated
     rays = {row.name: row.error_m for row in triangulated.points if row.name in triangulated.refuted}
-    count = sum(
-        not _miss_alike(row.error_m, rays.get(row.name)) for row in errors.points if row.name in errors.blunders
-    )
+    alike = {row.name for row in errors.points if _miss_alike(row.error_m, rays.get(row.name))}
+    off = sorted({*errors.blunders, *_heights_off(points.heights)} - alike)
+    count = len(off)
     level: Level = "good" if not count else "fair" if count <= errors.count / 5 else "poor"
     reason = (
         "the surface of the splat lies where the points are"
         if not count
         else "there the splat shows another surface: thin or moving things, or too little training"
     )
-    return level, f"{count} of {errors.count} off", reason, rule
+    names = f" ({listed(off)})" if off else ""
+    return level, f"{count} of {errors.count} off{names}", reason, rule
+
+
+def _heights_off(heights: Sequence[SurfaceHeight]) -> list[str]:
+    """Return the points at which the surface, seen from above, has another height than at all the others."""
+    known = {height.name: abs(height.du_m) for height in heights if height.du_m is not None}
+    if len(known) < _LEAST_HEIGHTS:
+        return []
+    limit_m = _HEIGHT_OFF * _ROBUST * statistics.median(known.values())
+    return [name for name, off_m in known.items() if off_m > limit_m]
 
 
 def _miss_alike(on_surface: Vector3 | None, triangulated: Vector3 | None) -> bool:

@@ -27,8 +27,14 @@ from pipelines.surface.matching import MatchSettings, StereoView
 from pipelines.surface.sweep import SweepPlanes, plane_sweep
 
 _PATIENCE_S = 600.0
+_COMPILATION_S = 45.0  # on two cores, beside a reconstruction
 _WIDTH, _HEIGHT = 48, 32
 _DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def compilation_s() -> float:
+    """Return the seconds, about, by which a run that compiles takes longer; 0: the user's cache has the kernels."""
+    return 0.0 if compilation_stamp(__name__).exists() else _COMPILATION_S
 
 
 def start_compilation() -> None:

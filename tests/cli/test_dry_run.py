@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from georef_cli import estimate
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.geodesy.crs import parse_crs
 from pipelines.jobs.costs import TimeLeft, iteration_seconds
+from pipelines.train import compilation
 from tests import bags, fakes
 from tests.cli_runs import Georef
 from tests.photos import write_flight
@@ -38,13 +41,45 @@ def test_before_the_first_run(georef: Georef, tmp_path: Path) -> None:
     assert training["peak_bytes"] > 100e6
     seconds = {row["stage"]: row["seconds"] for row in document["stages"]}
     assert all(value > 0 for value in seconds.values())
-    assert document["total"]["seconds"] == pytest.approx(sum(seconds.values()))
+    total = document["total"]
+    assert total["seconds"] == pytest.approx(sum(seconds.values()) + total["compilation_seconds"])
     assert document["total"]["peak_bytes"] >= training["peak_bytes"] and document["total"]["disk_bytes"] > 1e6
     origins = {row["flag"]: row["origin"] for row in document["stages"][5]["options"]}
     assert origins["--preset"] == "command line" and origins["--iterations"] == "preset"
     text = georef(*words).out
     assert "smoke: 200 iterations, 40 a photograph, at most 20000 Gaussians" in text
     assert "5 of 64×48 px" in text and "Nothing was run" in text and "In all: about" in text
+
+
+def test_a_machine_that_has_to_compile_its_kernels_says_so(
+    georef: Georef, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_flight(tmp_path / "photos", 5, lat=46.0, lon=7.7)
+    words = ("run", tmp_path / "ws", "--images", tmp_path / "photos", "--preset", "smoke", "--dry-run")
+    totals = []
+    for there in (True, False):
+        stamp = tmp_path / "stamp"
+        stamp.touch() if there else stamp.unlink()
+        monkeypatch.setattr(compilation, "compilation_stamp", lambda _: stamp)  # noqa: B023
+        totals.append(georef(*words, "--json").document["total"])
+        assert ("compiles the kernels" in georef(*words).out) == (not there)
+    later_s = totals[1]["seconds"] - totals[0]["seconds"]
+    assert totals[0]["compilation_seconds"] == 0 and totals[1]["compilation_seconds"] > 10
+    assert later_s == pytest.approx(totals[1]["compilation_seconds"])
+
+
+def test_times_of_a_run_that_compiled_teach_nothing_of_its_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    taught: list[str] = []
+    monkeypatch.setattr(estimate.pace, "learn", lambda stage, *_: taught.append(stage))
+    monkeypatch.setattr(estimate.pace, "used_by_others", lambda *_: 0.0)
+    names = ("ingest", "sfm", "train", "evaluate")
+    planned = [SimpleNamespace(stage=name, action="run") for name in names]
+    ran = [SimpleNamespace(stage=name, ran=True, manifest=SimpleNamespace(duration_s=1.0)) for name in names]
+    for compilation_s, expected in ((0.0, list(names)), (45.0, ["ingest", "evaluate"])):
+        taught.clear()
+        run = SimpleNamespace(planned=planned, modelled={}, compilation_s=compilation_s)
+        estimate.keep_times(run, ran, None)  # type: ignore[arg-type]
+        assert taught == expected
 
 
 def test_a_run_begins_with_the_estimate(georef: Georef, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from pipelines.report.points import cut_chips, points_facts
 from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, level_of, verdicts
 from pipelines.report.views import read_metrics
 from pipelines.survey.area import photographs_that_see
-from pipelines.survey.report import ByAxis, DistanceError, PointError, PredictedSigma
+from pipelines.survey.report import ByAxis, DistanceError, PointError, PredictedSigma, SurfaceHeight
 from pipelines.survey.report_parts import VarianceFactor
 from pipelines.survey.survey import LOCAL_FRAME, Survey
 from pipelines.survey.trained_survey import fix_differences
@@ -416,6 +416,24 @@ def test_longer_training_is_advised_only_where_photographs_show_the_ground(
     (verdict,) = (one for one in verdicts(report_with(test=figures), MEASURED, ()) if one.subject == "Test views")
     assert ("train longer" in verdict.reason) == longer
     assert longer or "photographs" in verdict.reason
+
+
+@pytest.mark.parametrize(("off_m", "level"), [((), "good"), ((-7.45,), "fair"), ((2.0, -0.6, 0.5), "poor")])
+def test_a_roof_that_is_missing_from_above_is_no_good_surface(off_m: tuple[float, ...], level: str) -> None:
+    """Behind its marks each point lies on the surface; straight from above, another surface is seen at some."""
+    small = np.random.default_rng(2).normal(0, 0.03, 13 - len(off_m))
+    heights = tuple(
+        SurfaceHeight(name=f"C{k}", du_m=float(du), place="raised") for k, du in enumerate([*off_m, *small])
+    )
+    report = report_with(triangulated=check_points_with(count=13), surface=check_points_with(count=13))
+    points = report.checkpoints.model_copy(update={"heights": heights})
+    found = {
+        verdict.subject: verdict
+        for verdict in verdicts(report.model_copy(update={"checkpoints": points}), MEASURED, ())
+    }
+    verdict = found["Surface at the points"]
+    names = ", ".join(f"C{k}" for k in range(len(off_m)))
+    assert (verdict.level, verdict.reading) == (level, f"{len(off_m)} of 13 off" + (f" ({names})" if names else ""))
 
 
 def test_the_surface_is_not_blamed_for_a_wrong_check_point() -> None:

@@ -121,6 +121,19 @@ def test_page_is_one_file_without_scripts(reported: Reported) -> None:
     assert max(steps) == 1  # no level is left out
 
 
+def test_paper_lacks_no_number_of_a_section(reported: Reported) -> None:
+    """Sections that are folded on the screen are left out of the PDF: they are the last ones."""
+    folded = ["folded" in attributes for attributes in re.findall(r"<section ([^>]*)>", reported.html)]
+    assert any(folded) and folded == sorted(folded)
+
+
+def test_sentences_on_maps_and_positions_are_true(reported: Reported) -> None:
+    """Axes are those of the CRS, and the residuals are those of test views as well."""
+    assert "count from the survey's origin" not in reported.html
+    solved = [camera.split for camera in reported.survey.solved.model.cameras]
+    assert "test" in solved and "positions of training photographs" not in reported.html
+
+
 def test_hostile_names_are_text(reported: Reported) -> None:
     assert "script" not in elements(reported.html).names
     assert reported.html.count(html.escape(HOSTILE)) > 10

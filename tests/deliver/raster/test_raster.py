@@ -255,6 +255,23 @@ def test_rasters_are_valid_and_say_where_they_are(workspace: Workspace) -> None:
             )
 
 
+@pytest.mark.parametrize(("height", "sigma"), [("dsm", "sigma_v"), ("dtm", "sigma_dtm")])
+def test_a_sidecar_states_the_heights_and_sigma_of_its_own_raster(
+    workspace: Workspace, height: str, sigma: str
+) -> None:
+    """Under the tower the terrain is bridged: it has no cell as high as the tower, and larger σ."""
+    values = {}
+    for name in (height, sigma):
+        with rasterio.open(workspace.path(f"raster/{name}.tif")) as raster:
+            values[name] = raster.read(1)[np.isfinite(raster.read(1))]
+    for name in (height, sigma):
+        sidecar = load_json(CrsSidecar, sidecar_path(workspace.path(f"raster/{name}.tif")))
+        assert sidecar.sigma is not None
+        assert sidecar.sigma.largest_sigma_v_m == pytest.approx(float(values[sigma].max()), rel=0.02)
+        assert sidecar.sigma.median_sigma_v_m == pytest.approx(float(np.median(values[sigma])), rel=0.02)
+        assert sidecar.bounds[1][2] == pytest.approx(float(values[height].max()), abs=0.05)
+
+
 def test_sigma_is_that_of_georeference_and_surface(workspace: Workspace) -> None:
     """On a surface without noise it is the σ that is predicted for the place."""
     grid = load_adjustment(workspace).grid
