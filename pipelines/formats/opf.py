@@ -8,6 +8,7 @@ Read without Pix4D's `pyopf`, which maps into memory whatever file a project nam
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -159,8 +160,10 @@ def has_tracks(path: Path) -> bool:
 
 def _project(path: Path) -> _Project:
     project = load_json(_Project, path)
-    if project.version != "1.0" and not project.version.startswith("1.0."):
-        message = f"The project is of version {project.version[:20]!r} of OPF, and 1.0 is read. Export it again."
+    if not re.fullmatch(r"1\.\d{1,4}", project.version):  # another minor version breaks nothing, a draft may
+        message = (
+            f"The project is of version {project.version[:20]!r} of OPF, and 1.0 to 1.9 are read. Export it again."
+        )
         raise InputError("opf-version", message, path=path, field="version")
     return project
 
