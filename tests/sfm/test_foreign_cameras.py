@@ -200,6 +200,24 @@ def test_intrinsics_of_nerfstudio_at_the_top_at_frames_and_by_angle(
     np.testing.assert_allclose(plain.params, [600 / np.tan(0.55), 600 / np.tan(0.55), 600, 450])
 
 
+@pytest.mark.parametrize("heights", [(1620.0, 1620.3), (0.0, 60.0)])
+def test_degrees_are_no_coordinates_of_realityscan(tmp_path: Path, heights: tuple[float, float]) -> None:
+    """A flight at one height, and one of an orbit; the same numbers as metres of a room are read."""
+    low, high = heights
+
+    def table(scale: float) -> Path:
+        rows = [
+            f"{i}.jpg,{7.75 + 1e-3 * i},{46.02 + 1e-3 * i},{(low + (high - low) * i / 2) * scale},0,0,0,24"
+            for i in range(3)
+        ]
+        (path := tmp_path / "a.csv").write_text("\n".join(["#name,x,y,alt,heading,pitch,roll,f", *rows]))
+        return path
+
+    with refused("positions-in-degrees", InputError):
+        solved(table(1.0))
+    assert len(solved(table(1e-5)).model.image_name) == 3
+
+
 @pytest.mark.parametrize("kind", ["opensfm", "opf"])
 def test_cameras_solved_on_smaller_copies_are_enlarged(
     surveyed: tuple[SparseModel, Survey], tmp_path: Path, kind: str
