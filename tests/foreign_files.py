@@ -202,6 +202,7 @@ def opf(model: SparseModel, folder: Path, *, uri: str = "tracks.gltf") -> Path:
                 "base_to_canonical": {"shift": [0.0, 0.0, 0.0], "scale": [1.0, 1.0, 1.0], "swap_xy": False},
             },
         ),
+        "input_control_points": ("input-control-points", {"gcps": [_control_point(uid)], "mtps": []}),
         "calibration": ("calibrated-cameras", {"sensors": [{"id": 5, "internals": internals}], "cameras": cameras}),
     }
     items = []
@@ -218,6 +219,12 @@ def opf(model: SparseModel, folder: Path, *, uri: str = "tracks.gltf") -> Path:
     (folder / "project.opf").write_text(json.dumps(project))
     _gltf(model, folder, uid)
     return folder / "project.opf"
+
+
+def _control_point(uid: Sequence[int]) -> dict[str, Any]:
+    marks = [{"camera_id": key, "position_px": [100.5, 200.5], "accuracy": 1.0} for key in uid[:2]]
+    place = {"crs": {"definition": "EPSG:4979"}, "coordinates": [46.0, 7.75, 1600.0], "sigmas": [0.02, 0.02, 0.03]}
+    return {"id": "G1", "geolocation": place, "marks": marks, "is_checkpoint": False}
 
 
 def _gltf(model: SparseModel, folder: Path, uid: Sequence[int]) -> None:

@@ -170,8 +170,9 @@ def read_shots(path: Path, photo_size: PhotoSize) -> SolvedCameras:
 
 def _camera_of(shot: _Properties, cameras: Mapping[str, _Camera], path: Path) -> str:
     """Return the key of a shot's camera: the one it names, or the only one of its size."""
-    if shot.camera in cameras:
-        return str(shot.camera)
+    named = [key for key in cameras if shot.camera is not None and _plain(key) == _plain(shot.camera)]
+    if len(named) == 1:
+        return named[0]
     fit = [
         key
         for key, camera in cameras.items()
@@ -181,6 +182,11 @@ def _camera_of(shot: _Properties, cameras: Mapping[str, _Camera], path: Path) ->
         message = f"{len(fit)} cameras of {CAMERAS} may be that of the photograph {shot.filename!r}; one is needed."
         raise InputError("lens-missing", message, path=path, field="camera")
     return fit[0]
+
+
+def _plain(key: str) -> str:
+    """Return the name of a camera as ODM's `cameras.json` has it: without the version of the name before it."""
+    return key.removeprefix("v2 ")
 
 
 def _lenses(cameras: Mapping[str, _Camera], used: set[str], path: Path) -> dict[str, ForeignLens]:

@@ -1,4 +1,4 @@
-"""Projects of the Open Photogrammetry Format 1.0 (Pix4D/opf-spec): calibrated cameras, their lenses and tie points.
+"""Projects of the Open Photogrammetry Format 1.0 (Pix4D/opf-spec): solved cameras, tie points and control points.
 
 A project (`.opf`) lists JSON files by format. Camera axes are x right, y up, z backward, and R_x(ω) R_y(φ) R_z(κ)
 turns them into the processing CRS. Principal points count from the corner of the top-left pixel. Perspective lenses
@@ -8,8 +8,9 @@ Read without Pix4D's `pyopf`, which maps into memory whatever file a project nam
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal, TypeVar
 from urllib.parse import unquote, urlsplit
 
@@ -20,6 +21,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import Remark, load_json
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.core.validators import stays_inside
+from pipelines.formats.ground_points import GroundPoints, ListedMark, ListedPoint, without_repeats
 from pipelines.formats.opf_tracks import read_tracks
 from pipelines.formats.solved_cameras import (
     Foreign,
@@ -38,6 +40,7 @@ PROGRAM = "OPF"
 PROJECT = "application/opf-project+json"
 _CAMERA_LIST = "application/opf-camera-list+json"
 _INPUT = "application/opf-input-cameras+json"
+_POINTS = "application/opf-input-control-points+json"
 _CALIBRATED = "application/opf-calibrated-cameras+json"
 _REFERENCE = "application/opf-scene-reference-frame+json"
 _GLTF = "model/gltf+json"
@@ -109,6 +112,29 @@ class _Calibrated(Foreign):
 
 class _Crs(Foreign):
     definition: str = ""
+    geoid_height: float | None = None
+
+
+class _Geolocation(Foreign):
+    crs: _Crs
+    coordinates: Vector3  # in the order of the axes of the CRS
+    sigmas: Vector3
+
+
+class _Mark(Foreign):
+    camera_id: int
+    position_px: tuple[float, float]
+
+
+class _Point(Foreign):
+    id: str = Field(min_length=1)
+    geolocation: _Geolocation
+    marks: list[_Mark]
+    is_checkpoint: bool = False
+
+
+class _InputPoints(Foreign):
+    gcps: list[_Point] = Field(default_factory=list)
 
 
 class _Reference(Foreign):
@@ -124,11 +150,7 @@ def read_opf(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     """
     project = _project(path)
     calibration, item, remarks = _calibration(project, path)
-    names = {
-        camera.id: _name(camera.uri)
-        for listed in _all(project, _CAMERA_LIST, _CameraList, path)
-        for camera in listed.cameras
-    }
+    names = _photographs(project, path)
     sizes = {sensor.id: sensor for given in _all(project, _INPUT, _InputCameras, path) for sensor in given.sensors}
     photographs: list[SolvedPhotograph] = []
     photograph_of: dict[int, int] = {}
@@ -157,10 +179,68 @@ def has_tracks(path: Path) -> bool:
     return any(found.format == _GLTF for item in _items(_project(path), "calibration") for found in item.resources)
 
 
+def read_opf_points(path: Path) -> GroundPoints:
+    """Read the control points that were given to a project, with their marks; manual tie points are left out.
+
+    Raises:
+        InputError: unreadable, not of OPF 1.0, no control point, several CRSs, a height above a geoid of which only
+            its own height is stated, or one point at two places.
+    """
+    project = _project(path)
+    names = _photographs(project, path)
+    found = [point for given in _all(project, _POINTS, _InputPoints, path) for point in given.gcps]
+    if not found:
+        raise InputError("no-control-points", "The project has no control points.", path=path, field="gcps")
+    points, marks = [], []
+    definitions = {point.geolocation.crs.definition for point in found}
+    if len(definitions) > 1:
+        message = f"The control points are in {len(definitions)} CRSs: export those of one."
+        raise InputError("several-crs", message, path=path, field="crs")
+    for point in found:
+        place = point.geolocation
+        if place.crs.geoid_height is not None:
+            message = (
+                f"The heights of {point.id} are above a geoid of which one height alone is stated, "
+                f"{place.crs.geoid_height:g}. Export the project with a geoid model, or list the points otherwise."
+            )
+            raise InputError("geoid-height", message, path=path, field="geoid_height")
+        sigma_h_m, sigma_v_m = max(place.sigmas[:2]), place.sigmas[2]
+        points.append(
+            ListedPoint(
+                line=1,
+                name=point.id,
+                xyz=place.coordinates,
+                sigma_h_m=sigma_h_m if sigma_h_m > 0 else None,
+                sigma_v_m=sigma_v_m if sigma_v_m > 0 else None,
+                is_check=point.is_checkpoint,
+            )
+        )
+        for mark in point.marks:
+            image = PurePosixPath(names.get(mark.camera_id, f"camera {mark.camera_id}").replace("\\", "/"))
+            inside = image.name if image.is_absolute() or ".." in image.parts else str(image)
+            marks.append(ListedMark(1, point.id, inside, *mark.position_px))
+    return GroundPoints(
+        path=path,
+        kind="OPF's control points",
+        points=without_repeats(points, path),
+        marks=tuple(marks),
+        crs_text=found[0].geolocation.crs.definition,
+        in_order_of_crs=True,
+    )
+
+
+def _photographs(project: _Project, path: Path) -> dict[int, str]:
+    """Return the names of the photographs by UID of their camera."""
+    lists = _all(project, _CAMERA_LIST, _CameraList, path)
+    return {camera.id: _name(camera.uri) for listed in lists for camera in listed.cameras}
+
+
 def _project(path: Path) -> _Project:
     project = load_json(_Project, path)
-    if project.version != "1.0" and not project.version.startswith("1.0."):
-        message = f"The project is of version {project.version[:20]!r} of OPF, and 1.0 is read. Export it again."
+    if not re.fullmatch(r"1\.\d{1,4}", project.version):  # another minor version breaks nothing, a draft may
+        message = (
+            f"The project is of version {project.version[:20]!r} of OPF, and 1.0 to 1.9 are read. Export it again."
+        )
         raise InputError("opf-version", message, path=path, field="version")
     return project
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.core.errors import InputError
 from pipelines.core.products import Remark
+from pipelines.core.types import FloatArray
 from pipelines.formats import tables
 from pipelines.formats.camera_files import CAM_FROM_GL
 from pipelines.formats.solved_cameras import PhotoSize, SolvedCameras, SolvedPhotograph, not_placed, solved_cameras
@@ -32,6 +33,7 @@ _VOCABULARY = {
     **dict.fromkeys(("focal", "focallength"), "f"),
 }
 _SAID_PX = 1.0
+_WIDEST_FLIGHT_DEG = 0.5
 
 
 def header_line(lines: list[tuple[int, str]]) -> tuple[int, str] | None:
@@ -79,6 +81,7 @@ def read_camera_csv(path: Path, photo_size: PhotoSize) -> SolvedCameras:
             most = max(most, max(size) * max(abs(values["px"]), abs(values["py"])))
         center = np.array([row.finite("x"), row.finite("y"), row.finite("alt")])
         photographs.append(SolvedPhotograph(name, key, world_from_gl @ CAM_FROM_GL.T, center))
+    _refuse_degrees(np.array([photograph.center_in_world for photograph in photographs]), path)
     remarks = [not_placed(PROGRAM, "the coordinate system of its export")]
     if most > _SAID_PX:
         sentence = (
@@ -87,6 +90,21 @@ def read_camera_csv(path: Path, photo_size: PhotoSize) -> SolvedCameras:
         )
         remarks.append(Remark(code="principal-point-assumed", sentence=sentence))
     return solved_cameras(path, PROGRAM, photographs, lenses, photo_size, remarks=remarks)
+
+
+def _refuse_degrees(center: FloatArray, path: Path) -> None:
+    """Refuse positions whose x and y are longitude and latitude: those are no coordinates of one unit with heights.
+
+    Flights span less than half a degree, and heights of metres are far larger than such spans.
+    """
+    span = np.ptp(center, axis=0)
+    within = (np.abs(center[:, :2]) <= (180.0, 90.0)).all() and span[:2].max() < _WIDEST_FLIGHT_DEG
+    if within and (span[2] > 10 * span[:2].max() or np.abs(center[:, 2]).max() > 100 * span[:2].max() > 0):
+        message = (
+            f"x and y span {span[:2].max():.2g}, heights {span[2]:.2g}: they are longitude and latitude. Export "
+            "the cameras in a projected or local coordinate system."
+        )
+        raise InputError("positions-in-degrees", message, path=path, field="x, y")
 
 
 def _lens(size: tuple[int, int], focal_mm: float, values: dict[str, float]) -> ForeignLens:

@@ -32,6 +32,7 @@ _MOST_OFF_ROTATION = 1e-3  # of the entries of R Rᵀ; programs write four decim
 _FARTHEST = 1e9  # the Earth's radius is 6.4e6 m
 LONGEST_SIDE_PX = 1_000_000
 _FAR = 100.0  # extents of the cameras, beyond which the world is shifted
+_PROPORTION_PX = 1.0  # of the smaller picture, by which rounded sides may differ from its proportions
 # A lens that is replaced by another: said above, refused above (px, and of the longer side).
 _SAID_PX, _MOST_PX, _MOST_OF_SIDE = 0.05, 2.0, 2e-3
 
@@ -101,15 +102,18 @@ def solved_cameras(
         message = f"The position of the photograph {bad.name!r} is no number, or beyond {_FARTHEST:g}."
         raise InputError("position-impossible", message, path=path, field="position")
     shift = _shift(center)
-    keys = {key: number for number, key in enumerate(dict.fromkeys(row.lens for row in rows), start=1)}
-    cameras, said = _cameras(keys, lenses, path)
+    sizes = [size for row in rows if (size := photo_size(row.name)) is not None]
+    kinds = [(row.lens, size) for row, size in zip(rows, sizes, strict=True)]
+    keys = {kind: number for number, kind in enumerate(dict.fromkeys(kinds), start=1)}
+    cameras, scales, said = _cameras(keys, lenses, path)
     cam_from_world = np.swapaxes(rotation, 1, 2)
+    scale = np.array([scales[keys[kind]] for kind in kinds]).reshape(-1, 2)
     seen = _points(ties, np.array(chosen, dtype=np.int64), len(photographs), path)
     model = SparseModel(
         cameras=cameras,
         image_id=np.arange(1, len(rows) + 1),
         image_name=tuple(row.name for row in rows),
-        image_camera_id=np.array([keys[row.lens] for row in rows], dtype=np.int64),
+        image_camera_id=np.array([keys[kind] for kind in kinds], dtype=np.int64),
         rotation_cam_from_local=cam_from_world,
         translation_cam_from_local=-np.einsum("nij,nj->ni", cam_from_world, center - shift),
         point_id=np.arange(1, len(seen.position) + 1),
@@ -118,7 +122,7 @@ def solved_cameras(
         point_error_px=np.full(len(seen.position), np.nan),
         obs_point=seen.obs_point,
         obs_image=seen.obs_photograph,
-        obs_xy_px=seen.obs_xy_px,
+        obs_xy_px=seen.obs_xy_px * scale[seen.obs_photograph],
     )
     return SolvedCameras(program, model, foreign, (*remarks, *said))
 
@@ -160,10 +164,11 @@ def _shift(center: FloatArray) -> FloatArray:
 
 
 def _cameras(
-    keys: Mapping[str, int], lenses: Mapping[str, ForeignLens], path: Path
-) -> tuple[dict[int, Camera], list[Remark]]:
-    cameras, replaced = {}, []
-    for key, number in keys.items():
+    keys: Mapping[tuple[str, tuple[int, int]], int], lenses: Mapping[str, ForeignLens], path: Path
+) -> tuple[dict[int, Camera], dict[int, tuple[float, float]], list[Remark]]:
+    """Return cameras by number, the scales from the file's pixels to those of the photographs, and remarks."""
+    cameras, scales, replaced, resized = {}, {}, [], []
+    for (key, size), number in keys.items():
         if key not in lenses:
             message = f"Photographs have the camera {key[:80]!r}, which the file does not describe."
             raise InputError("lens-missing", message, path=path, field="cameras")
@@ -184,15 +189,39 @@ def _cameras(
             raise InputError("lens-not-convertible", message, path=path, field="cameras")
         if error > _SAID_PX:
             replaced.append((key[:80], camera.model, error))
-        cameras[number] = camera
+        cameras[number], scales[number] = _resized(camera, size)
+        if scales[number] != (1.0, 1.0):
+            resized.append((lens.size, size))
+    remarks = []
+    if resized:
+        (width, height), size = resized[0]
+        sentence = (
+            f"The cameras were solved on pictures of {width}×{height} pixels, the photographs have "
+            f"{size[0]}×{size[1]}: lenses and observations are scaled."
+        )
+        remarks.append(Remark(code="pictures-resized", sentence=sentence))
     if not replaced:
-        return cameras, []
+        return cameras, scales, remarks
     worst = max(replaced, key=lambda entry: entry[2])
     sentence = (
         f"{worst[1]} stands for the lens of {listed([entry[0] for entry in replaced])}: {worst[2]:.2f} px off "
         "in the image at most."
     )
-    return cameras, [Remark(code="lens-replaced", sentence=sentence)]
+    return cameras, scales, [*remarks, Remark(code="lens-replaced", sentence=sentence)]
+
+
+def _resized(camera: Camera, size: tuple[int, int]) -> tuple[Camera, tuple[float, float]]:
+    """Return the camera of photographs of another size and the same proportions, and its scale along x and y.
+
+    Programs solve cameras on smaller copies. A pinhole may be that of undistorted copies: it stays as it is.
+    """
+    across, along = size[0] / camera.width, size[1] / camera.height
+    apart_px = abs(across / along - 1.0) * min(camera.width, camera.height)
+    if (across, along) == (1.0, 1.0) or apart_px > _PROPORTION_PX or camera.model == "PINHOLE":
+        return camera, (1.0, 1.0)
+    params = camera.params.copy()
+    params[:4] *= (across, along, across, along)  # fx, fy, cx, cy in all models that are made here
+    return Camera(camera.model, *size, params), (across, along)
 
 
 def _points(ties: TiePoints | None, chosen: IntArray, count: int, path: Path) -> TiePoints:

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.formats import ground_points, metashape
+from pipelines.formats import ground_points, metashape, opf
 from pipelines.formats.ground_points import GroundPoints, ListedMark
 from pipelines.formats.tables import beginning, is_number, separator_of, split
 from pipelines.geodesy.crs import PointCrs
@@ -116,15 +116,18 @@ def _with_table_of_marks(file: GroundFile, path: Path, marks: Sequence[ListedMar
 def _recognised(path: Path, options: IngestOptions, remarks: Remarks) -> GroundPoints:
     """Read ground points; the kind of the file follows from its content, and is noted.
 
-    1. XML: Metashape's markers.
-    2. A line that begins with `#Label`: Metashape's reference.
-    3. A first line of four or more cells between commas, semicolons or tabs: PIX4D's table of points.
-    4. A row of four cells between spaces, the last three numbers: a list of points.
-    5. Anything else: OpenDroneMap's `gcp_list.txt`.
+    1. JSON of an OPF project: its control points.
+    2. XML: Metashape's markers.
+    3. A line that begins with `#Label`: Metashape's reference.
+    4. A first line of four or more cells between commas, semicolons or tabs: PIX4D's table of points.
+    5. A row of four cells between spaces, the last three numbers: a list of points.
+    6. Anything else: OpenDroneMap's `gcp_list.txt`.
     """
     head = beginning(path)
     lines = [line.strip() for line in head.splitlines() if line.strip()]
-    if head.lstrip().startswith("<"):
+    if head.lstrip().startswith("{") and opf.PROJECT in head:
+        listed = opf.read_opf_points(path)
+    elif head.lstrip().startswith("<"):
         listed = metashape.read_markers_xml(path)
     elif any(metashape.HEADER.match(line) for line in lines):
         listed = metashape.read_markers(path)

@@ -64,6 +64,7 @@ def _known_dictionaries(names: tuple[str, ...]) -> tuple[str, ...]:
 
 # Files of other kinds beside the photographs, such as thumbnails and logs, make nothing stale.
 PhotographFolder = Annotated[Path, InputMarker(SUFFIXES | HEIF_SUFFIXES)]
+GroundPointsPath = Annotated[Path, InputMarker(beside=((".opf", ("**/*.json",)),))]
 MaskFolder = Annotated[Path, InputMarker(frozenset({".png"}))]
 FrameDistance = Annotated[Every, from_text(_every), WRITTEN]
 TimeOffset = Annotated[
@@ -144,12 +145,12 @@ class IngestOptions(StageOptions):
         None, description="DJI's .MRK beside a trajectory by time: times and antenna offsets of the photographs."
     )
     geo: InputPath | None = Field(None, description="ODM geo.txt with the image positions.")
-    gcp: InputPath | None = Field(
+    gcp: GroundPointsPath | None = Field(
         None,
-        description="Ground control points: ODM's gcp_list.txt, Metashape's markers (XML) or reference, or PIX4D's "
-        "CSV; the content decides.",
+        description="Ground control points: ODM's gcp_list.txt, Metashape's markers (XML) or reference, PIX4D's "
+        "CSV, or an OPF project; the content decides.",
     )
-    checkpoints: InputPath | None = Field(None, description="Check points, in any form of --gcp.")
+    checkpoints: GroundPointsPath | None = Field(None, description="Check points, in any form of --gcp.")
     marks: InputPath | None = Field(
         None, description="PIX4D's CSV of image marks: image, point, x, y; for points whose file has none."
     )

@@ -20,12 +20,13 @@ from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.cameras import run
 from pipelines.deliver.options import ExportCamerasOptions
 from pipelines.formats.cloud_ply import open_cloud_ply
-from pipelines.formats.colmap import read_sparse, write_sparse
+from pipelines.formats.colmap import flatten, read_sparse, write_sparse
 from pipelines.formats.georef_sidecar import CrsSidecar, GeorefSidecar, sidecar_path
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, geo_from_enu_at, lla_from_enu
 from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.sfm.imported_model import import_model, import_poses
 from pipelines.survey.photographs import covered_pinhole
 from pipelines.survey.survey import Survey
 from pipelines.survey.trained_model import TrainedLens, TrainedModel
@@ -170,6 +171,26 @@ def test_nerfstudio_projects_a_point_to_its_pixel(handover: Handover) -> None:
         expected = project(handover.scene.camera, ((point_in_geo - center) @ rotation)[None])[0]
         np.testing.assert_allclose(pixel, expected, atol=1e-5)
     assert [frame["file_path"] for frame in document["frames"]] == list(handover.scene.names)
+
+
+def test_sfm_imports_what_is_exported(handover: Handover) -> None:
+    """The same cameras and, of COLMAP's model, the same tie points."""
+    survey, given = load_json(Survey, handover.workspace.path(SURVEY)), read_sparse(handover.out / "colmap")
+    taken = {
+        "colmap": flatten(import_model(handover.out / "colmap", survey)),
+        "transforms.json": flatten(import_poses(handover.out / "transforms.json", survey)[0]),
+    }
+    for found in taken.values():
+        assert found.image_name == given.image_name
+        np.testing.assert_allclose(found.rotation_cam_from_local, given.rotation_cam_from_local, atol=1e-6)
+        np.testing.assert_allclose(found.cam_center_in_local, given.cam_center_in_local, atol=1e-6)
+        ray = np.array([[0.2, -0.3, 1.0], [-0.4, 0.1, 1.0]])
+        for image in range(IMAGES):
+            pixels = project(found.camera_of(image), ray)
+            np.testing.assert_allclose(pixels, project(given.camera_of(image), ray), atol=1e-6)
+    np.testing.assert_allclose(taken["colmap"].point_in_local, given.point_in_local, atol=1e-6)
+    np.testing.assert_allclose(taken["colmap"].obs_xy_px, given.obs_xy_px, atol=1e-6)
+    np.testing.assert_array_equal(taken["colmap"].obs_point, given.obs_point)
 
 
 def test_nerfstudio_finds_points_and_splits(handover: Handover) -> None:

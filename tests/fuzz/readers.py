@@ -41,6 +41,7 @@ from pipelines.formats.ground_points import (
 )
 from pipelines.formats.image_file import inspect_image, read_bytes
 from pipelines.formats.metashape import read_cameras, read_markers, read_markers_xml
+from pipelines.formats.opf import read_opf_points
 from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
 from pipelines.formats.spz import write_spz
 from pipelines.formats.trajectory_csv import read_trajectory
@@ -118,6 +119,8 @@ def _solved(writer: Callable[[SparseModel, Path], Path], name: str) -> Reader:
         found = foreign_file(folder / name)
         if found is not None:
             found.read(found.path, lambda _: (1200, 900))
+            if found.path.suffix == ".opf":
+                read_opf_points(found.path)
 
     return Reader(prepare, read, "**/*")
 

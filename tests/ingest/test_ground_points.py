@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -187,3 +188,53 @@ def test_points_with_one_mark_each_do_not_place_a_survey(tmp_path: Path, marks: 
         survey_and_track(options, None)
     # How many points have how many marks, and how many a point needs.
     assert {3 + marks, 1, 2} <= set(map(int, re.findall(r"\d+", str(error.value))))
+
+
+def _opf(folder: Path, crs: dict[str, object], coordinates: list[float]) -> Path:
+    """Write an OPF project with a control point and a check point, and nothing that was calibrated."""
+    marks = [{"camera_id": 1 << 63, "position_px": [10.5, 20.5], "accuracy": 1.0}]
+    place = {"crs": crs, "coordinates": coordinates, "sigmas": [0.02, 0.03, 0.05]}
+    points = [
+        {"id": name, "geolocation": place, "marks": marks, "is_checkpoint": name == "C"} for name in ("G1", "C")
+    ]
+    listed = [{"id": 1 << 63, "uri": "file:///C:/flight/a.jpg"}]
+    files = {"camera_list": ("camera-list", {"cameras": listed})}
+    files["input_control_points"] = ("input-control-points", {"gcps": points, "mtps": []})
+    items = []
+    for kind, (name, content) in files.items():
+        form = f"application/opf-{name}+json"
+        (folder / f"{name}.json").write_text(json.dumps({"format": form, "version": "1.0", **content}))
+        items.append({"type": kind, "resources": [{"uri": f"{name}.json", "format": form}]})
+    (path := folder / "project.opf").write_text(
+        json.dumps({"format": "application/opf-project+json", "version": "1.0", "items": items})
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("crs", "coordinates"),
+    [
+        ("EPSG:4979", [46.02, 7.75, 1620.0]),  # latitude first, as the CRS has it
+        (pyproj.CRS("EPSG:4979").to_wkt("WKT2_2019"), [46.02, 7.75, 1620.0]),
+        ("EPSG:4978", ecef_from_lla([46.02, 7.75, 1620.0]).tolist()),
+    ],
+)
+def test_control_points_of_an_opf_project(tmp_path: Path, crs: str, coordinates: list[float]) -> None:
+    options, remarks = IngestOptions(gcp=_opf(tmp_path, {"definition": crs}, coordinates)), Remarks()
+    file, _ = read_ground_files(options, remarks)
+    assert file is not None
+    tied = tie_marks(file, SIZES, options.sigma_mark, remarks)
+    np.testing.assert_allclose(
+        tied.points[0].position_in_ecef, ecef_from_lla([46.02, 7.75, 1620.0]), rtol=0, atol=1e-6
+    )
+    assert [(point.name, point.is_check) for point in tied.points] == [("G1", False), ("C", True)]
+    (mark,) = tied.points[0].marks
+    assert (mark.image, mark.x_px, mark.y_px) == ("a.jpg", 10.5, 20.5)
+    assert (tied.points[0].sigma_h_m, tied.points[0].sigma_v_m) == (0.03, 0.05)
+
+
+def test_heights_above_one_height_of_a_geoid_are_refused(tmp_path: Path) -> None:
+    path = _opf(tmp_path, {"definition": "EPSG:4326+5773", "geoid_height": 47.1}, [46.02, 7.75, 1570.0])
+    with refused("geoid-height", InputError) as error:
+        read_ground_files(IngestOptions(gcp=path), Remarks())
+    assert "47.1" in error.value.message

@@ -200,6 +200,63 @@ def test_intrinsics_of_nerfstudio_at_the_top_at_frames_and_by_angle(
     np.testing.assert_allclose(plain.params, [600 / np.tan(0.55), 600 / np.tan(0.55), 600, 450])
 
 
+@pytest.mark.parametrize("heights", [(1620.0, 1620.3), (0.0, 60.0)])
+def test_degrees_are_no_coordinates_of_realityscan(tmp_path: Path, heights: tuple[float, float]) -> None:
+    """A flight at one height, and one of an orbit; the same numbers as metres of a room are read."""
+    low, high = heights
+
+    def table(scale: float) -> Path:
+        rows = [
+            f"{i}.jpg,{7.75 + 1e-3 * i},{46.02 + 1e-3 * i},{(low + (high - low) * i / 2) * scale},0,0,0,24"
+            for i in range(3)
+        ]
+        (path := tmp_path / "a.csv").write_text("\n".join(["#name,x,y,alt,heading,pitch,roll,f", *rows]))
+        return path
+
+    with refused("positions-in-degrees", InputError):
+        solved(table(1.0))
+    assert len(solved(table(1e-5)).model.image_name) == 3
+
+
+@pytest.mark.parametrize("kind", ["opensfm", "opf"])
+def test_cameras_solved_on_smaller_copies_are_enlarged(
+    surveyed: tuple[SparseModel, Survey], tmp_path: Path, kind: str
+) -> None:
+    """1200×900 are 3000×2251 pixels, rounded; other proportions, and pinholes, are refused."""
+    model, survey = surveyed
+    large = survey.model_copy(
+        update={"cameras": (survey.cameras[0].model_copy(update={"width": 3000, "height": 2251}),)}
+    )
+    found = flatten(import_model(WRITERS[kind](model, tmp_path), large))
+    scale = np.array([2.5, 2251 / 900])
+    camera = found.camera_of(0)
+    assert (camera.width, camera.height) == (3000, 2251)
+    np.testing.assert_allclose(camera.params[:4], LENS.params[:4] * np.tile(scale, 2), rtol=1e-12)
+    np.testing.assert_allclose(camera.params[4:], LENS.params[4:], atol=1e-12)
+    np.testing.assert_allclose(found.obs_xy_px, model.of_images(np.arange(6)).obs_xy_px * scale, atol=1e-3)
+    square = large.model_copy(update={"cameras": (large.cameras[0].model_copy(update={"height": 3000}),)})
+    with refused("photograph-size", InputError):
+        import_poses(WRITERS[kind](model, tmp_path), square)
+    flat = replace(model, cameras={1: Camera("PINHOLE", 1200, 900, np.array([1020.0, 1020, 603, 447]))})
+    with refused("undistorted-copies", InputError):
+        import_poses(WRITERS[kind](flat, tmp_path), large)
+
+
+def test_names_of_cameras_in_odm_with_and_without_version(
+    surveyed: tuple[SparseModel, Survey], tmp_path: Path
+) -> None:
+    """A shot names `v2 x`, ODM's `cameras.json` the same camera `x`, beside another one of the same size."""
+    model, _ = surveyed
+    folder = write.odm(model, tmp_path / "p")
+    right, wrong = write.opensfm_camera(model), {**write.opensfm_camera(model), "focal_x": 0.5, "focal_y": 0.5}
+    (folder / "cameras.json").write_text(json.dumps({"y": wrong, "x": right}))
+    with refused("lens-missing", InputError):
+        solved(folder)
+    shots = folder / "odm_report/shots.geojson"
+    shots.write_text(shots.read_text().replace('"filename"', '"camera": "v2 x", "filename"'))
+    assert_same_cameras(solved(folder).model, model)
+
+
 def test_columns_of_realityscan_in_any_order(surveyed: tuple[SparseModel, Survey], tmp_path: Path) -> None:
     model, _ = surveyed
     path = write.realityscan(model, tmp_path / "a.csv")
