@@ -73,7 +73,7 @@ def mesh_from_sides(glb: Path) -> np.ndarray:
     import trimesh
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-    scene = trimesh.load(glb, force="scene")
+    scene = trimesh.load_scene(glb)
     (node,) = scene.graph.nodes_geometry
     y_up, name = scene.graph[node]
     shape = scene.geometry[name]
