@@ -1,5 +1,5 @@
 """Make the pictures of the documents: `python docs/make_picture.py flight WORKSPACE --view 1`,
-`orthophoto WORKSPACE`, `report WORKSPACE`, or `viewer WORKSPACE`.
+`orthophoto WORKSPACE`, `mesh WORKSPACE`, `report WORKSPACE`, or `viewer WORKSPACE`.
 
 `flight` needs an evaluated workspace, and shows this flight:
 
@@ -8,9 +8,9 @@
         --gcp survey/gcp_list.txt --checkpoints survey/checkpoints.txt \\
         --preset fast --iterations 2500 --max-image-size 720
 
-`orthophoto` needs the rasters, and shows a flight with `--flight grid --images 40 --size 960x720 --seed 5`, run
-likewise. `report` needs the report of any workspace, such as that of `make demo`, and `viewer` any trained one;
-both need Chromium.
+`orthophoto` needs the rasters and `mesh` the mesh (`--deliver raster,mesh`); they show an orbit that is flown with
+`--images 30 --size 640x480 --seed 21` and run likewise. `report` needs the report of any workspace, as that of
+`make demo`, and `viewer` any trained one; both need Chromium. `mesh` needs the extras `mesh` and `simulator`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from pipelines.core.stages import MESH_GLB
 from pipelines.core.workspace import Workspace
 from pipelines.report.chromium import NO_NETWORK, chromium_path
 from pipelines.view.options import ViewOptions
@@ -65,6 +66,40 @@ def beside_hillshade(preview: Path, hillshade: Path) -> np.ndarray:
     seen = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     gap = np.full((parts[0][seen].shape[0], GAP_PX, 3), 255, dtype=np.uint8)
     return sized(np.hstack([parts[0][seen], gap, parts[1][seen]]))
+
+
+def mesh_from_sides(glb: Path) -> np.ndarray:
+    """Return a textured mesh from two opposite sides, BGR, shaded by the angle to the view."""
+    import trimesh
+    from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+    scene = trimesh.load_scene(glb)
+    (node,) = scene.graph.nodes_geometry
+    y_up, name = scene.graph[node]
+    shape = scene.geometry[name]
+    vertices = trimesh.transform_points(shape.vertices, y_up) @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]])
+    body = trimesh.Trimesh(vertices, shape.faces, process=False)
+    texture, rays = np.asarray(shape.visual.material.baseColorTexture.convert("RGB")), RayMeshIntersector(body)
+    middle, reach = np.median(vertices, axis=0), float(np.ptp(np.quantile(vertices, [0.05, 0.95], axis=0)[:, :2]))
+    width, height, sides = 1200, 840, []
+    for azimuth in np.radians([-60.0, 120.0]):
+        arm = reach * np.array([0.8 * np.cos(azimuth), 0.8 * np.sin(azimuth), 0.6])
+        ahead = -arm / np.linalg.norm(arm)
+        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        across, up = np.meshgrid(np.arange(width) - width / 2, height / 2 - np.arange(height))
+        ray = (ahead + (across[..., None] * right + up[..., None] * np.cross(right, ahead)) / width).reshape(-1, 3)
+        start = np.tile(middle + arm, (len(ray), 1))
+        place, pixel, face = rays.intersects_location(start, ray, multiple_hits=False)
+        share = trimesh.triangles.points_to_barycentric(vertices[shape.faces[face]], place)
+        uv = np.einsum("nk,nkj->nj", share, shape.visual.uv[shape.faces[face]]) * [1, -1] + [0, 1]
+        column, row = (np.clip(uv * texture.shape[1::-1], 0, np.array(texture.shape[1::-1]) - 1)).astype(int).T
+        slant = np.abs(np.einsum("ni,ni->n", body.face_normals[face], ray[pixel]))
+        picture = np.full((len(ray), 3), 255, dtype=np.uint8)
+        shade = 0.6 + 0.4 * slant / np.linalg.norm(ray[pixel], axis=1)
+        picture[pixel] = texture[row, column] * shade[:, None]
+        sides.append(picture.reshape(height, width, 3)[..., ::-1])
+    return sized(np.hstack([sides[0], np.full((height, GAP_PX, 3), 255, dtype=np.uint8), sides[1]]))
 
 
 def parts_of_report(page: Path) -> np.ndarray:
@@ -147,7 +182,7 @@ def sized(picture: np.ndarray) -> np.ndarray:
 def main() -> None:
     """Write the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("picture", choices=["flight", "orthophoto", "report", "viewer"])
+    parser.add_argument("picture", choices=["flight", "orthophoto", "mesh", "report", "viewer"])
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--view", type=int, default=0, help="number of the test view")
     options = parser.parse_args()
@@ -161,6 +196,8 @@ def main() -> None:
         if not page.exists():
             raise SystemExit("no report there: run `georef report` on the workspace first")
         picture = parts_of_report(page)
+    elif options.picture == "mesh":
+        picture = mesh_from_sides(Workspace(options.workspace).path(MESH_GLB))
     elif options.picture == "orthophoto":
         rasters = options.workspace / "raster"
         picture = beside_hillshade(rasters / "preview.png", rasters / "hillshade.png")

@@ -70,7 +70,8 @@ def poisson_mesh(points: MeasuredPoints, voxel_m: float, folder: Path, progress:
     """Return the surface through points, without what lies far from them; a scratch folder holds files meanwhile.
 
     1. Points with a large σ are left out near others (`certain_points`), and the solver runs.
-    2. Faces farther than `rim_m` from all points are cut.
+    2. Faces farther than `rim_m` from all points, those with a large σ too, are cut. Otherwise a gap would be open
+       between points that are used and the uncertain ones beyond them.
     3. Connected faces cut so are put back if none of them is farther than half of `closed_gap_m`: they close a gap.
 
     Raises:
@@ -89,7 +90,7 @@ def poisson_mesh(points: MeasuredPoints, voxel_m: float, folder: Path, progress:
         whole = RawMesh(*read_mesh_ply(folder / _SURFACE))
     finally:
         _remove(folder, _POINTS, _SURFACE)
-    return near_points(whole, used)
+    return near_points(whole, points)
 
 
 def certain_points(points: MeasuredPoints) -> MeasuredPoints:

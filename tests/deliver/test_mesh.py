@@ -32,6 +32,7 @@ from pipelines.surface.mesh import (
     distances,
     edges_of,
     holes_of,
+    parts_of,
     vertex_normals,
     without_islands,
 )
@@ -183,6 +184,18 @@ def test_uncertain_points_count_only_where_no_others_are() -> None:
         used = certain_points(MeasuredPoints(points.position, points.normal, sigma_m, points.spacing_m))
         assert (np.hypot(used.position[:, 0] - 20, used.position[:, 1]).min() < 0.3) == kept
         assert (sigma_m == 0.03).sum() <= len(used.position) < len(points.position)
+
+
+@pytest.mark.parametrize("sigma_m", [0.2, 0.4])
+def test_no_gap_is_left_before_uncertain_points(sigma_m: float, tmp_path: Path) -> None:
+    """Ground whose east fewer photographs see, as beyond the edge of one: it is measured from end to end."""
+    points = plane(40.0)
+    east = points.position[:, 0] > np.median(points.position[:, 0])
+    uncertain = MeasuredPoints(points.position, points.normal, np.where(east, sigma_m, 0.03), points.spacing_m)
+    assert len(certain_points(uncertain).position) < len(points.position)  # a strip of them is left out
+    mesh = poisson_mesh(uncertain, points.spacing_m, tmp_path)
+    assert holes_of(mesh) == []
+    assert parts_of(mesh)[0] == 1
 
 
 def test_depth_gives_cells_of_a_voxel() -> None:
