@@ -15,6 +15,7 @@ from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks, remove_chunks, wo
 from pipelines.sfm.colmap_database import require_sound
 from pipelines.sfm.estimate import estimate_reconstruction, why_too_large
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
+from pipelines.sfm.learned_weights import learned_remedy
 from pipelines.sfm.lens_check import lenses_astray
 from pipelines.sfm.mapping import triangulate
 from pipelines.sfm.options import SfmOptions
@@ -93,7 +94,7 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
         raise DegenerateGeometryError(
             "no-matches",
             "No two photographs could be matched: overlap or texture is too low. Try a larger --max-features, or "
-            "--pairs exhaustive.",
+            f"--pairs exhaustive.{learned_remedy(job.options.features)}",
         )
     model, complete, fixes = aligned.models[0], None, None
     if len(job.survey.images) > _DRIFTLESS_UP_TO:

@@ -43,6 +43,14 @@ def missing_for_learned() -> str | None:
     return f"learned features need their weights, which `{FETCH}` fetches" if absent else None
 
 
+def learned_remedy(features: str) -> str:
+    """Return the sentence that learned features may connect what `--features` has left apart; empty: none."""
+    if features == "sift":
+        return " Learned features may connect them: --features auto."
+    missing = missing_for_learned()
+    return "" if missing is None else f" Learned features may connect them; {missing}."
+
+
 def weights_file(name: str) -> Path:
     """Return the file of weights in the user's cache.
 

@@ -20,7 +20,7 @@ from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import quiet_colmap
 from pipelines.sfm.features import SfmJob, masks_beside
-from pipelines.sfm.learned_weights import missing_for_learned
+from pipelines.sfm.learned_weights import learned_remedy
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.reconstructor import reconstructor_of
 from pipelines.sfm.unregistered import unregistered
@@ -74,15 +74,8 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
     warnings = list(summary.warnings)
     if database.is_file():
         with quiet_colmap() as colmap:
-            warnings += unregistered(colmap, database, model, _learned_remedy(options))
+            warnings += unregistered(colmap, database, model, learned_remedy(options.features))
     return {**vars(summary), "warnings": [warning.model_dump() for warning in warnings]}
-
-
-def _learned_remedy(options: SfmOptions) -> str:
-    if options.features == "sift":
-        return " Learned features may connect them: --features auto."
-    missing = missing_for_learned()
-    return "" if missing is None else f" Learned features may connect them; {missing}."
 
 
 def _summarise(model: Any, survey: Survey) -> Summary:

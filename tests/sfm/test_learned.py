@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
+import cv2
 import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
+from pipelines.core.progress import SILENT
+from pipelines.formats.colmap import pycolmap_module
 from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
-from pipelines.sfm import learned_weights
-from pipelines.sfm.learned_features import LearnedFeatures, quarters_to_north
+from pipelines.sfm import colmap_reconstruction, learned_weights
+from pipelines.sfm.features import SfmJob
+from pipelines.sfm.learned_features import LearnedFeatures, LearnedMatcher, quarters_to_north
+from pipelines.sfm.rounds import Alignment
 from pipelines.survey.survey import Attitude, SurveyImage
 from tests.refusals import refused
+from tests.sfm_scenes import CONFIG, Photographs, survey_of
 
 NADIR = np.diag([1.0, -1.0, -1.0])  # geo from cam: the picture's top looks north
 
@@ -123,3 +131,66 @@ def test_weights_are_unpacked_and_checked(cache: Path, tmp_path: Path, monkeypat
     (cache / "aliked-n16rot.pth").write_bytes(b"another")
     with refused("weights-changed", InputError):
         learned_weights.weights_file("aliked-n16rot.pth")
+
+
+def winter(summer: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The same place under thin snow with drifts, in light from elsewhere and of another colour."""
+    height, width = summer.shape[:2]
+    drifts = cv2.GaussianBlur(rng.random((height, width)), (0, 0), 3.0)
+    drifts = (drifts - drifts.mean()) / drifts.std()
+    light = np.linspace(0.7, 1.2, height)[:, None, None] * [1.1, 1.0, 0.85]
+    seen = (0.4 + 0.4 * summer / 255.0 + 0.04 * drifts[:, :, None]) * light
+    return np.asarray(np.clip(255.0 * seen + rng.normal(0, 5, summer.shape), 0, 255).astype(np.uint8))
+
+
+def job_of(folder: Path, names: list[str]) -> SfmJob:
+    return SfmJob(survey_of(names), folder, folder / "database.db", CONFIG)
+
+
+@pytest.mark.parametrize("features", ["auto", "sift"])
+def test_photographs_without_matches_are_told_of_learned_features(
+    features: Literal["auto", "sift"], cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = job_of(tmp_path, ["a.jpg", "b.jpg"])
+    monkeypatch.setattr(colmap_reconstruction, "align", lambda *_: Alignment([], "incremental"))
+    job = replace(job, options=job.options.model_copy(update={"features": features}))
+    with refused("no-matches") as caught:
+        colmap_reconstruction.map_matches(pycolmap_module(), job, SILENT)
+    assert not cache.exists()
+    remedies = ("--features auto",) if features == "sift" else (learned_weights.FETCH, "georefgs[learned]")
+    assert any(remedy in str(caught.value) for remedy in remedies)
+
+
+@pytest.mark.slow
+def test_another_season_is_matched_where_sift_finds_nothing(photographs: Photographs, tmp_path: Path) -> None:
+    """SIFT's matches of the two seasons fit no geometry; those of the learned features are those of one place."""
+    if (missing := learned_weights.missing_for_learned()) is not None:
+        pytest.skip(missing)
+    first, second = photographs.names[:2]
+    summer = cv2.imread(str(photographs.folder / first))
+    other = winter(cv2.imread(str(photographs.folder / second)), np.random.default_rng(0))
+    for name, pixels in ((first, summer), (second, other)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), pixels)
+    job, matcher = job_of(tmp_path, [f"{first}.png", f"{second}.png"]), LearnedMatcher(2)
+    found = [matcher.features(job, image) for image in job.survey.images]
+    rows = matcher.matches(*found)
+    learned = [each.in_photograph_px()[rows[:, side]] for side, each in enumerate(found)]
+
+    sift = cv2.SIFT_create(1000)
+    (at, described), (there, compared) = (sift.detectAndCompute(pixels, None) for pixels in (summer, other))
+    pairs = cv2.BFMatcher().knnMatch(described, compared, k=2)
+    near = [one for one, next_one in pairs if one.distance < 0.8 * next_one.distance]
+    by_sift = [
+        np.array([at[one.queryIdx].pt for one in near]).reshape(-1, 2),
+        np.array([there[one.trainIdx].pt for one in near]).reshape(-1, 2),
+    ]
+    assert agreeing(by_sift) < 15  # as many as COLMAP asks for
+    assert agreeing(learned) > 50
+
+
+def agreeing(places: list[np.ndarray]) -> int:
+    """Number of matches that fit one epipolar geometry within 1.5 px."""
+    if len(places[0]) < 8:
+        return 0
+    _, inlier = cv2.findFundamentalMat(*places, cv2.FM_RANSAC, 1.5, 0.999)
+    return 0 if inlier is None else int(inlier.sum())
