@@ -57,6 +57,13 @@ def run(stage: StageRun, options: ReportOptions) -> Summary:
     )
 
 
+_ACCURACY = {
+    "measured": "with measured and predicted accuracy",
+    "predicted": "with predicted accuracy: nothing has measured it",
+    "unknown": "without a statement of accuracy",
+}
+
+
 def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: StageRun) -> tuple[Page, SummaryFacts]:
     workspace, survey = stage.workspace, evaluated.solved.survey
     with stage.progress.task("sections", _STEPS) as task:
@@ -85,7 +92,7 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         title=options.title or f"Survey report: {workspace.root.name}",
         subtitle=f"{what} in a local metric frame, not on Earth, with predicted accuracy"
         if survey.origin is None
-        else f"Georeferenced {what}, with measured and predicted accuracy",
+        else f"Georeferenced {what}, {_ACCURACY[evaluated.report.headline.kind]}",
         about={"Made": moment(datetime.now(UTC)), "Program": f"GeoRefGS {__version__}"},
         cover=cover_facts(evaluated, overlap, lenses, options),
         sections=(

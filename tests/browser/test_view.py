@@ -473,9 +473,10 @@ def test_a_change_of_tab_draws_nothing_anew(hill: Opened) -> None:
         hill.settle()
     assert asked == []
     hill.page.locator("#overlay").focus()
-    hill.page.keyboard.press("ArrowLeft")
-    wait(lambda: len(asked) > 0)
+    with hill.page.expect_request("**/picture", timeout=PATIENCE_MS):
+        hill.page.keyboard.press("ArrowLeft")
     hill.settle()
+    assert asked
 
 
 def test_results_are_above_the_fold_of_a_phone(server: ViewerServer, browser: Browser) -> None:

@@ -131,6 +131,7 @@ def test_sentences_on_maps_and_positions_are_true(reported: Reported) -> None:
     """Axes are those of the CRS, and the residuals are those of test views as well."""
     assert "count from the survey's origin" not in reported.html
     solved = [camera.split for camera in reported.survey.solved.model.cameras]
+    assert "with measured and predicted accuracy" in reported.html
     assert "test" in solved and "positions of training photographs" not in reported.html
 
 
@@ -164,6 +165,7 @@ def test_what_is_missing_is_said_with_what_to_do(tmp_path: Path) -> None:
         "nothing measures the accuracy: surveyed points that enter no solution would",
     ):
         assert sentence in text
+    assert "with measured" not in text and "(RMSE, H: horizontal" not in text  # nothing was
     # What was not made or not asked for is no section: the client cannot make it.
     assert not {"lidar", "reference", "rasters"} & set(re.findall(r'<section id="([^"]+)"', page))
     assert_for_client(page)
