@@ -288,4 +288,5 @@ def _sharpness(pixels: NDArray[Any], values: tuple[float, float] | None) -> floa
 
 
 def _grey_values(pixels: NDArray[Any]) -> NDArray[Any]:
-    return np.nan_to_num(pixels.astype(np.float32) if pixels.ndim == 2 else pixels.mean(axis=2, dtype=np.float32))
+    grey = pixels.astype(np.float32) if pixels.ndim == 2 else pixels.mean(axis=2, dtype=np.float32)
+    return np.asarray(np.nan_to_num(grey))
