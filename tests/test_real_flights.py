@@ -15,7 +15,7 @@ from tests.scripts import REPOSITORY, load_script
 
 real_flights = load_script(REPOSITORY / "examples/flights/real_flights.py")
 
-RUN = real_flights.Run(peak_mb=2345.0, error="", at="2026-11-27")
+RUN = real_flights.Run(peak_mb=2345.0, error="", at="2026-11-27", version="0.1.0")
 
 
 def _flight(name: str, **values: str) -> object:
@@ -37,10 +37,10 @@ def test_table_and_page_say_what_the_products_say(finished: Workspace, tmp_path:
     assert re.fullmatch(r"\d+ % of \d+\.\d\d ha", cells[6])
 
     arguments = argparse.Namespace(preset="smoke", out=out)
-    failed = real_flights.Run(100.0, "/home/me/photos/a.jpg: is no photograph", "2026-11-27")
+    failed = real_flights.Run(100.0, "/home/me/photos/a.jpg: is no photograph", "2026-11-27", "0.1.0")
     page = real_flights.page_of([(flight, RUN), (_flight("gone"), failed)], [_flight("x")], arguments, tmp_path)
-    assert f"| [A flight](#{flight.name}) |" in page and "**Failed**: a.jpg: is no photograph" in page
-    assert re.search(r"\[A flight\]\(#gone\) \| – \|.*\| failed \|", page)
+    assert "| [A flight](#a-flight) |" in page and "**Failed**: a.jpg: is no photograph" in page
+    assert re.search(r"\[A flight\]\(#a-flight\) \| – \|.*\| failed \|", page)
     assert (tmp_path / f"real_{flight.name}.jpg").stat().st_size > 500
     assert "## Not run" in page and "/home/" not in page
     for sentence in real_flights.remarks(real_flights.figures_of(finished.root)):

@@ -65,6 +65,7 @@ class Run:
     peak_mb: float
     error: str
     at: str
+    version: str
 
 
 def main() -> None:
@@ -118,7 +119,7 @@ def run_flight(flight: Flight, data: Path, out: Path, preset: str) -> Run:
     error = (
         "" if os.waitstatus_to_exitcode(status) == 0 else (re.findall(r"(?m)^error: .*", said) or [said[-300:]])[-1]
     )
-    run = Run(usage.ru_maxrss / 1024, error.removeprefix("error: "), started)
+    run = Run(usage.ru_maxrss / 1024, error.removeprefix("error: "), started, described_version())
     if before is not None and not before.error and not run.error and run.peak_mb < before.peak_mb:
         return before  # Little was left to do.
     record_file(workspace).write_text(json.dumps(asdict(run)), encoding="utf-8")
@@ -173,9 +174,14 @@ def is_made(folder: Path) -> bool:
 def row_of(flight: Flight, run: Run, workspace: Path) -> str:
     """Return a flight's line of the table, in Markdown."""
     figures = figures_of(workspace)
-    cells = [f"[{flight.title}](#{flight.name})", registered(figures), f"{minutes(figures):.1f} min"]
+    cells = [f"[{flight.title}](#{anchor(flight)})", registered(figures), f"{minutes(figures):.1f} min"]
     cells += [f"{run.peak_mb / 1000:.1f} GB", accuracy(figures), quality(figures), measured(figures)]
     return "| " + " | ".join([*cells, "failed" if run.error else str(len(remarks(figures)))]) + " |"
+
+
+def anchor(flight: Flight) -> str:
+    """Return the anchor of a flight's heading, as GitHub and the site make it."""
+    return re.sub(r"[^\w\- ]", "", flight.title.lower()).replace(" ", "-")
 
 
 def minutes(figures: Figures) -> float:
@@ -250,7 +256,7 @@ def page_of(
         .read_text("utf-8")
         .format(
             preset=arguments.preset,
-            commit=described_version(),
+            versions=", ".join(sorted({run.version for _, run in rows})),
             hardware=hardware(),
             dates=dates(run for _, run in rows),
         )
@@ -267,11 +273,13 @@ def section(flight: Flight, run: Run, workspace: Path, images: Path) -> str:
     place = f"[{flight.source.removeprefix('https://github.com/')}]({flight.source})"
     place += f" at `{flight.commit[:12]}`" if flight.commit else ""
     lines = [
-        f"## {flight.title} {{#{flight.name}}}",
+        f"## {flight.title}",
         "",
         f"{place}, {flight.licence}; {flight.size}. {flight.test}.",
     ]
-    if thumbnail(workspace / "raster/preview.png", images / f"real_{flight.name}.jpg"):
+    if "-SA" not in flight.licence and thumbnail(
+        workspace / "raster/preview.png", images / f"real_{flight.name}.jpg"
+    ):
         lines += ["", f"![Orthophoto of {flight.title}](images/real_{flight.name}.jpg)"]
     if run.error:
         lines += ["", f"**Failed**: {plain(run.error)}"]
