@@ -50,11 +50,11 @@ class ColmapReconstructor:
         with quiet_colmap() as colmap:
             if len(job.survey.images) > job.options.chunk_size:
                 join_chunks(colmap, job, load_json(ChunkPlan, out / PLAN), out, progress)
-                model = map_matches(colmap, job, progress)
+                model, lens_held = map_matches(colmap, job, progress)
             else:
                 require_sound(job.database)
-                model = reconstruct(colmap, job, progress)
-            adjust = partial(_adjust, colmap, job, progress=progress)
+                model, lens_held = reconstruct(colmap, job, progress)
+            adjust = partial(_adjust, colmap, job, lens_held=lens_held, progress=progress)
             model, shutter = correct_tie_points(model, job.survey, adjust)
             write_reconstruction(model, job.sparse)
             if shutter is not None:
@@ -63,8 +63,8 @@ class ColmapReconstructor:
         return model
 
 
-def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
-    """Return the largest `pycolmap.Reconstruction` of the photographs, robustly adjusted.
+def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> tuple[Any, bool]:
+    """Return the largest `pycolmap.Reconstruction` of the photographs, adjusted, and whether its lens is held.
 
     Raises:
         InputError: a photograph does not exist or is not that of the survey, or a camera prior is none of COLMAP's
@@ -86,8 +86,11 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     return map_matches(colmap, job, progress)
 
 
-def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
-    """Return the largest model of a database with features and matches, adjusted; raises as `reconstruct`."""
+def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> tuple[Any, bool]:
+    """Return the largest model of a database with features and matches, adjusted, and whether its lens is held.
+
+    Raises as `reconstruct`. A held lens stays as stated in every later adjustment, too.
+    """
     colmap.set_random_seed(job.options.seed)
     aligned = align(colmap, job, progress)
     if not aligned.models:
@@ -104,7 +107,8 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
     mapped = type(model)(model) if aligned.lens_held else None
     _adjust(colmap, job, model, fixes=fixes, complete=complete, progress=progress)
     astray = lenses_astray(model, job.survey)
-    if astray and mapped is not None:
+    lens_held = bool(astray) and mapped is not None
+    if lens_held:
         for camera_id, reason in astray.items():
             log.warning(
                 "The photographs do not determine the lens of camera %d, which would have %s: it is held.",
@@ -118,7 +122,7 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> Any:
                 "Camera %d was solved with %s. State the focal length by --focal-px.",
                 camera_id, reason, extra={"code": "lens-astray"},
             )  # fmt: skip
-    return model
+    return model, lens_held
 
 
 def _adjust(colmap: Any, job: SfmJob, model: Any, **how: Any) -> None:

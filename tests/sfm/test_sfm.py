@@ -165,7 +165,7 @@ def test_file_names_with_blanks(photographs: Photographs, tmp_path: Path, monkey
     monkeypatch.setattr("pipelines.sfm.colmap_reconstruction.candidate_pairs", lambda *_: asked)
     job = SfmJob(survey, photos, tmp_path / "database.db", CONFIG)
     with quiet_colmap() as colmap:
-        model = reconstruct(colmap, job, SILENT)
+        model, _ = reconstruct(colmap, job, SILENT)
     names = {image.name for image in survey.images}
     assert {image.name for image in model.images.values()} <= names
     assert model.num_reg_images() >= 3
@@ -184,7 +184,7 @@ def test_run_that_was_killed_while_matching_is_continued(mapped: Workspace, tmp_
     survey = load_json(Survey, mapped.path(SURVEY))
     with quiet_colmap() as colmap:
         job = SfmJob(survey, mapped.root / "photos", tmp_path / "database.db", CONFIG)
-        model = reconstruct(colmap, job, SILENT)
+        model, _ = reconstruct(colmap, job, SILENT)
     assert {image.name for image in model.images.values()} == {image.name for image in survey.images}
     with pycolmap.Database.open(job.database) as database:
         assert database.num_images() == IMAGES
@@ -264,7 +264,7 @@ def test_global_mapper(mapped: Workspace, tmp_path: Path) -> None:
     config = CONFIG.model_copy(update={"mapper": "global"})
     with quiet_colmap() as colmap:
         job = SfmJob(survey, mapped.root / "photos", tmp_path / "database.db", config)
-        model = reconstruct(colmap, job, SILENT)
+        model, _ = reconstruct(colmap, job, SILENT)
     assert model.num_reg_images() == IMAGES
 
 
