@@ -37,6 +37,7 @@ _COARSEST = (
     2.0  # largest width of a pixel over the median: far ground of oblique photographs is no part of the area
 )
 _MOST_THROUGH = 0.5  # largest number of views that look through a cell, over the number of those that agree
+_SCRAP = 0.01  # of the ground that three photographs see
 _SIGMA_PX = 0.25  # of a ray, in pixels of the depth maps
 _RESOLVED_PX = 1.0  # of the training: largest σ of a measured height, as of the cells of rasters
 _LAYOUT = b"measured ground 3"
@@ -51,6 +52,7 @@ def area_of(
     1. A boundary is taken whole, as is, with `--fill all`, the ground that three photographs see. So is that ground
        before there is a trained model.
     2. Otherwise the area is what is measured of it: without spikes and islands, with holes filled up to a width.
+       Where that is hardly anything, it is all that is seen: a scrap of a hundredth tells nothing of a survey.
 
     Raises:
         InputError: the boundary cannot be read, states no CRS, or lies elsewhere; or a photograph cannot be read.
@@ -65,10 +67,13 @@ def area_of(
     fill = "all" if options.fill is None and stated is not None else options.fill
     if fill != "all":
         outline = ground.outline(whole.polygon, fill)
-        if outline is None:
+        if outline is None or (stated is None and outline.area < _SCRAP * whole.polygon.area):
             log.warning(
-                "No ground is measured by %d training views: the area is all that is seen.", LEAST_PHOTOGRAPHS
-            )
+                "Hardly any ground is measured by %d training views (%.0f of %.0f m²): the area is all that is "
+                "seen, and what was not measured is interpolated. Train longer.",
+                LEAST_PHOTOGRAPHS, 0.0 if outline is None else outline.area, whole.polygon.area,
+                extra={"code": "hardly-measured"},
+            )  # fmt: skip
         else:
             source = f"ground that {LEAST_PHOTOGRAPHS} training views measure"
             whole = replace(

@@ -17,13 +17,16 @@ from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, REPORT
 from pipelines.core.workspace import Workspace
 from pipelines.splat.gaussians import read_gaussians, write_gaussians
+from pipelines.surface import measured_area
 from pipelines.surface.measured_area import area_of
 from pipelines.survey.area import Area
+from pipelines.survey.measured_ground import MeasuredGround
 from pipelines.survey.options import CrsOptions, FilledAreaOptions
 from pipelines.survey.report import read_report
 from pipelines.survey.target_crs import target_crs
 from pipelines.survey.trained_survey import load_trained
 from tests.deliver.raster.test_raster import GEO_FROM_MODEL, GSD, UTM, write_trained
+from tests.refusals import logged_codes
 
 LAKE, POND = shapely.Point(-7.5, 5.0).buffer(3.0), shapely.Point(8.0, -7.0).buffer(0.5)
 
@@ -69,6 +72,28 @@ def test_painted_ground_is_no_part_of_the_area(workspace: Workspace, tmp_path: P
     squares = area(painted).polygon.intersection(LAKE).area / LAKE.area
     assert squares < 0.9  # the photographs' borders of squares are missing; within a square they are plain too
     assert area(whole).polygon.intersection(LAKE).area > 0.99 * LAKE.area
+
+
+@pytest.mark.parametrize(("radius_m", "whole"), [(0.4, True), (4.0, False)])
+def test_a_scrap_is_no_area(
+    workspace: Workspace,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    radius_m: float,
+    whole: bool,
+) -> None:
+    """A hundredth of the ground by chance, as after a training of a few steps, is not what a user wants to see."""
+    seen = area(workspace, "all")
+    ground = measured_area.measured_ground(load_trained(workspace), workspace)
+    rows, columns = np.indices(ground.measured.shape)
+    middle = shapely.centroid(seen.polygon)
+    place = ground.corner + ground.size_m[0] * np.stack([columns, rows], axis=-1)
+    near = np.linalg.norm(place - [middle.x, middle.y], axis=-1) < radius_m
+    few = MeasuredGround(near, ground.corner, ground.size_m)
+    monkeypatch.setattr(measured_area, "measured_ground", lambda *_: few)
+    found = area(workspace)
+    assert (found.polygon.area == seen.polygon.area) == whole
+    assert ("hardly-measured" in logged_codes(caplog)) == whole
 
 
 def test_area_is_found_once(workspace: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
