@@ -166,9 +166,11 @@ def test_ctrl_c_keeps_the_work(tmp_path: Path) -> None:
 def test_files_go_through_a_storage(tmp_path: Path) -> None:
     """The workers see nothing but the store; a mission whose engine was killed goes on from its checkpoint."""
     missions, store = write_missions(tmp_path / "missions", "a", "b"), ("--storage", (tmp_path / "store").as_uri())
+    # On a busy machine one job begins seconds after the other.
+    slowly = COUNTING.replace("time.sleep(0.05)", "time.sleep(0.2)")
     listed = missions / "valley.toml"
     listed.write_text('[missions.one]\nimages = "a/images"\n[missions.two]\nimages = "b/images"\n', "utf-8")
-    with running_cluster(tmp_path, COUNTING) as cluster:
+    with running_cluster(tmp_path, slowly) as cluster:
         process = batch(cluster, listed, *store)
         scratch = tmp_path / "scratch"
         wait_until(lambda: len(list(scratch.glob("**/train.partial/checkpoint"))) == 2, "both begin")
