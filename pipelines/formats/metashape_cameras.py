@@ -69,9 +69,8 @@ def read_metashape(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     """Read the enabled and aligned cameras of a chunk.
 
     Raises:
-        InputError: unreadable, not well-formed XML, several chunks, a value that is no number, no aligned camera,
-        or
-            what `solved_cameras` refuses.
+        InputError: unreadable, not well-formed XML, several chunks, a value that is no number, no aligned
+            camera, or what `solved_cameras` refuses.
     """
     reader = _Reader(path)
     read_xml(reader, limit_bytes=_MAX_BYTES, kind="file of cameras")
