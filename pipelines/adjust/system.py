@@ -37,7 +37,6 @@ from pipelines.robust.statistics import NOISE_WEIGHT, cauchy_loss, cauchy_weight
 
 _ROUNDS = 150
 _STILL = 5e-6  # change of a whitened residual that ends the descent
-_SMALL = 1e-3  # change of a whitened residual below which shrinking steps are taken whatever the cost
 _NOISE = 1e-10  # relative rise of the cost that rounding causes
 _HALVINGS = 12  # of a step that raises the cost
 _SLOW = 0.8  # of the step before: a step that is longer is slow to shrink
@@ -357,9 +356,8 @@ def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None)
 
     A quasi-Newton step takes the slope at the present state and a factor that may be older: the minimum is exact,
     and few factorisations are needed. The first steps take that of `normal`, if there is one. A step that raises
-    the cost is halved, unless it is small and shrinks: a similarity of the whole leaves the corrections, which are
-    linear, for one that is not, and beside the minimum that alone may raise the cost. Where steps shrink slowly,
-    because the weights of a redescending kernel are stiff, the next one is stretched.
+    the cost is halved. Where steps shrink slowly, because the weights of a redescending kernel are stiff, the next
+    one is stretched.
 
     Raises:
         ConvergenceError: the steps do not end.
@@ -378,7 +376,7 @@ def minimise(problem: Problem, start: State, normal: NormalMatrix | None = None)
             new = problem.residuals(moved)
             differences = (float(np.abs(new[kind] - residuals[kind]).max(initial=0.0)) for kind in new)
             change, reached = max(differences, default=0.0), cost_at(problem, moved, new)
-            if reached <= cost + _NOISE * (1 + abs(cost)) or change < max(_STILL, min(_SMALL, last)):
+            if reached <= cost + _NOISE * (1 + abs(cost)) or change < _STILL:
                 break
         else:
             raise _not_converged(change)

@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 import pytest
 
-from pipelines.adjust import system
 from pipelines.adjust.posterior import camera_covariances, intersection_jacobian
 from pipelines.adjust.state import State, SystematicError, SystematicErrors
 from pipelines.adjust.system import Minimum, NormalMatrix, Problem, linearised, minimise
@@ -405,21 +404,6 @@ def test_minimum_and_covariances_are_those_of_the_plain_adjustment(name: str) ->
     moved = intersection_jacobian(seeing(network, CONTROL + 1.0), np.ones(IMAGES * len(CONTROL)))
     by_unknowns = np.concatenate([moved.by_poses.toarray(), moved.by_lens.reshape(-1, LENSES)], axis=1)
     close_in_sigma(of_linear(normal, problem, by_unknowns), by_unknowns @ outer @ by_unknowns.T)
-
-
-@pytest.mark.parametrize("name", ["control points", "two sessions", "distances", "frozen lens"])
-def test_steps_go_on_to_the_minimum_far_from_the_base(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Corrections of decimetres: the cost rises by more than rounding where steps are still a millionth of σ."""
-    kinds, errors, frozen = CASES[name]
-    terms = measured(EXACT, GEO_FROM_MODEL, np.random.default_rng(7), 3.0)
-    bundle = stated_information(EXACT, np.full(len(EXACT.obs_point), 3 * SIGMA_PX))
-    problem = Problem(poses_of(EXACT), bundle, tuple(terms[kind] for kind in kinds), errors, lens_frozen=frozen)
-    near = minimise(problem, start_of(problem, GEO_FROM_MODEL)).state
-    assert np.abs(near.correction[:, 3:]).max() > 0.05
-    monkeypatch.setattr(system, "_STILL", 1e-8)
-    exact = minimise(problem, start_of(problem, GEO_FROM_MODEL)).state
-    of_near, of_exact = problem.residuals(near), problem.residuals(exact)
-    assert max(np.abs(of_near[kind] - of_exact[kind]).max() for kind in of_exact if len(of_exact[kind])) < 1e-4
 
 
 def test_threads_may_share_a_normal_matrix() -> None:
