@@ -92,8 +92,9 @@ def solved_cameras(
     """
     if not photographs:
         raise InputError("no-solved-cameras", f"{program} has solved no camera in this file.", path=path)
-    chosen = [row for row, photograph in enumerate(photographs) if photo_size(photograph.name) is not None]
-    foreign = tuple(photograph.name for row, photograph in enumerate(photographs) if row not in set(chosen))
+    size_of = [photo_size(photograph.name) for photograph in photographs]
+    chosen = [row for row, size in enumerate(size_of) if size is not None]
+    foreign = tuple(photograph.name for photograph, size in zip(photographs, size_of, strict=True) if size is None)
     rows = [photographs[row] for row in chosen]
     rotation = np.array([_rotation(photograph, path) for photograph in rows]).reshape(-1, 3, 3)
     center = np.array([photograph.center_in_world for photograph in rows], dtype=np.float64).reshape(-1, 3)
@@ -102,7 +103,7 @@ def solved_cameras(
         message = f"The position of the photograph {bad.name!r} is no number, or beyond {_FARTHEST:g}."
         raise InputError("position-impossible", message, path=path, field="position")
     shift = _shift(center)
-    sizes = [size for row in rows if (size := photo_size(row.name)) is not None]
+    sizes = [size for size in size_of if size is not None]
     kinds = [(row.lens, size) for row, size in zip(rows, sizes, strict=True)]
     keys = {kind: number for number, kind in enumerate(dict.fromkeys(kinds), start=1)}
     cameras, scales, said = _cameras(keys, lenses, path)

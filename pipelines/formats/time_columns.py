@@ -54,8 +54,9 @@ def _is_of_week(table: tables.Table) -> bool:
     """Return whether the seconds of a GPS week stand beside it: as such, or as a time of at most a week."""
     if "tow" in table.columns:
         return True
-    first = table.rows[0].text("timestamp") if "timestamp" in table.columns else ""
-    return tables.is_number(first) and abs(float(first.replace(",", "."))) <= WEEK_S
+    first = table.rows[0]
+    stated = "timestamp" in table.columns and tables.is_number(first.text("timestamp"))
+    return stated and abs(first.number("timestamp")) <= WEEK_S
 
 
 def _times_of_week(table: tables.Table) -> FloatArray:
