@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray, joined_rows, rows_of
 from pipelines.geometry.footprints import first_of_voxels
+from pipelines.robust.statistics import NORMAL_MAD
 from pipelines.surface.m3c2 import CONFIDENCE_95, Square, TiledPoints, at_random, m3c2, oriented_normals
 from pipelines.surface.visibility import SeenSurface
 from pipelines.survey.report_parts import CloudDistances, M3c2Figures, ReferenceGroup, SurfaceScore
@@ -177,7 +178,6 @@ def _covered(position: FloatArray, reference: FloatArray, cover_m: float) -> Boo
 THRESHOLDS_M = (0.05, 0.1, 0.3)
 _STEP_M = 1e-3
 _BINS = round(FARTHEST_M / _STEP_M) + 2  # 0, then one for each millimetre, then all beyond
-_NMAD = 1.4826
 _NO_KINDS = Kinds(np.zeros(0, np.int64), np.zeros(0, np.int64))
 _NO_CORES = CorePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), _NO_KINDS)
 
@@ -251,7 +251,7 @@ def m3c2_figures(distance_m: FloatArray, lod_m: FloatArray) -> M3c2Figures:
         measured=len(d),
         median_m=float(np.median(d)),
         mean_m=float(d.mean()),
-        nmad_m=float(_NMAD * np.median(np.abs(d - np.median(d)))),
+        nmad_m=float(NORMAL_MAD * np.median(np.abs(d - np.median(d)))),
         rmse_m=float(np.sqrt(np.mean(d**2))),
         abs_95_m=float(np.quantile(np.abs(d), 0.95)),
         median_lod_m=float(np.median(lod)),

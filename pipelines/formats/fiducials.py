@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from pipelines.core.types import ByteArray, FloatArray
+from pipelines.robust.statistics import NORMAL_MAD
 
 LEAST_SIDE_PX = 12.0  # of a tag that is looked for: a module of the smallest dictionary has two pixels then
 # A side leaves out its ends, where the other sides blur it.
@@ -207,7 +208,7 @@ def _side(
         design = np.stack([np.ones(used.sum()), place[used]], axis=1)
         (shift, slope), *_ = np.linalg.lstsq(design, edge[used], rcond=None)
         residual = edge - shift - slope * place
-        scatter = max(1.4826 * float(np.median(np.abs(residual[used]))), _LEAST_SIGMA_PX)
+        scatter = max(NORMAL_MAD * float(np.median(np.abs(residual[used]))), _LEAST_SIGMA_PX)
         used = np.abs(residual) <= _FAR_SIGMAS * scatter
         if used.sum() < least:
             return None

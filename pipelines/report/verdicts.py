@@ -13,6 +13,7 @@ from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.sentences import listed
 from pipelines.core.types import Vector3
 from pipelines.report.page import decibel, number_text, share
+from pipelines.robust.statistics import NORMAL_MAD
 from pipelines.survey.report import (
     CheckPointErrors,
     CheckPoints,
@@ -80,7 +81,6 @@ _OF_CHECK_POINTS = {"prediction-rejected": "more", "prediction-pessimistic": "le
 _OF_FIXES: tuple[Group, ...] = ("fixes", "horizontal drift", "vertical drift")
 _SCATTER = 2.25  # variance factor, of σ that are larger by one half
 _HEIGHT_OFF, _LEAST_HEIGHTS = 6.0, 5  # robust σ of the heights, and points that have one
-_ROBUST = 1.4826  # σ of normal errors over the median of their sizes
 _SMALL = 0.25  # variance factor, below which residuals are less than half of σ
 
 _Fields = tuple[Level, str, str, str]  # of a verdict without its subject, in their order
@@ -344,7 +344,7 @@ def _heights_off(heights: Sequence[SurfaceHeight]) -> list[str]:
     known = {height.name: abs(height.du_m) for height in heights if height.du_m is not None}
     if len(known) < _LEAST_HEIGHTS:
         return []
-    limit_m = _HEIGHT_OFF * _ROBUST * statistics.median(known.values())
+    limit_m = _HEIGHT_OFF * NORMAL_MAD * statistics.median(known.values())
     return [name for name, off_m in known.items() if off_m > limit_m]
 
 

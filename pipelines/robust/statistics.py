@@ -55,7 +55,7 @@ def cauchy_loss(squared: ArrayLike, dimension: int) -> FloatArray:
     return np.asarray(scale2 * np.log1p(np.asarray(squared, dtype=np.float64) / scale2))
 
 
-_NORMAL_MAD = 1.4826  # σ / MAD of a normal distribution
+NORMAL_MAD = 1.4826  # σ / MAD of a normal distribution
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a residual with σ = 1 in either coordinate
 _WEISZFELD_STEPS = 50
 _WEISZFELD_NEAR = 1e-6  # lower limit of a distance, so that a point at the median keeps a finite weight
@@ -93,7 +93,7 @@ def median_chi2(dimension: int) -> float:
 def mad_sigma(values: ArrayLike) -> float:
     """Return the σ of values (N,) from their median absolute deviation; up to half may be outliers."""
     array = np.asarray(values, dtype=np.float64)
-    return float(_NORMAL_MAD * np.median(np.abs(array - np.median(array))))
+    return float(NORMAL_MAD * np.median(np.abs(array - np.median(array))))
 
 
 def rayleigh_sigma(lengths: ArrayLike) -> float:
