@@ -8,6 +8,7 @@ from georef_cli.command import Command
 from georef_cli.evaluation import evaluated_cameras, with_evaluation
 from georef_cli.output import print_json, print_rich
 from pipelines.core import staleness as states
+from pipelines.core.manifest import Memo
 from pipelines.core.options import notation
 from pipelines.core.plan import option_origins
 from pipelines.core.stages import BY_NAME
@@ -16,10 +17,11 @@ from pipelines.survey.headline import headline_of, outdated, with_newest_solutio
 
 
 def _status(workspace: Workspace, with_options: bool, as_json: bool) -> None:
-    rows, newest = states.status(workspace), with_newest_solution(workspace)
+    memo: Memo = {}  # the same large files decide the states and the newest solution
+    rows, newest = states.status(workspace, memo), with_newest_solution(workspace, memo)
     solved = evaluated_cameras(newest, with_area=False)
     cautions = with_evaluation({**states.cautions_by_stage(newest), **outdated(workspace, newest)}, solved)
-    accuracy = headline_of(newest) if solved is None else solved.headline
+    accuracy = headline_of(newest, memo) if solved is None else solved.headline
     origins = [row for spec in BY_NAME.values() for row in option_origins(workspace, spec)] if with_options else []
     if not as_json:
         print_rich(tables.states(rows, cautions), *tables.accuracy_line(accuracy), *tables.cautions(cautions))

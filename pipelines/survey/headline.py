@@ -71,34 +71,36 @@ def predicted(scene: AccuracySummary, cautions: tuple[Remark, ...]) -> Headline:
     return Headline(kind="predicted", rmse_h_m=scene.rms_sigma_h_m, rmse_v_m=vertical_m)
 
 
-def headline_of(workspace: Workspace) -> Headline | None:
+def headline_of(workspace: Workspace, memo: Memo | None = None) -> Headline | None:
     """Return the accuracy of a workspace: that of its evaluation, else the predicted one; None: neither exists.
 
-    An evaluation of an earlier solution states none. Nor does a damaged report; `georef status` names it.
+    An evaluation of an earlier solution states none. Nor does a damaged report; `georef status` names it. The memo
+    of hashes by path is extended.
     """
-    if is_evaluated(workspace):
+    if is_evaluated(workspace, memo):
         with contextlib.suppress(GeorefError):
             return read_report(workspace.path(REPORT)).headline
     return predicted_headline(workspace)
 
 
-def is_evaluated(workspace: Workspace) -> bool:
+def is_evaluated(workspace: Workspace, memo: Memo | None = None) -> bool:
     """Return whether there is an evaluation of the solution that `load_solution` returns."""
     solution = (MODEL,) if workspace.has(MODEL) else (SIM3, ADJUSTMENT, MODEL)
-    return workspace.has(REPORT) and is_made_from(workspace, BY_NAME["evaluate"], solution, {})
+    hashed = {} if memo is None else memo
+    return workspace.has(REPORT) and is_made_from(workspace, BY_NAME["evaluate"], solution, hashed)
 
 
-def with_newest_solution(workspace: Workspace) -> Workspace:
+def with_newest_solution(workspace: Workspace, memo: Memo | None = None) -> Workspace:
     """Return the workspace as if what a newer SfM model or `init-sim3` has outdated did not exist.
 
     That are a solution or a training of another SfM model, a training of another `init-sim3`, and the evaluation of
-    another solution.
+    another solution. The memo of hashes by path is extended.
     """
-    memo: Memo = {}
+    memo = {} if memo is None else memo
     for stage, made_from in {"init-sim3": (SPARSE,), "train": (SPARSE, SIM3, ADJUSTMENT)}.items():
         if not is_made_from(workspace, BY_NAME[stage], made_from, memo):
             workspace = workspace.without(BY_NAME[stage])
-    return workspace if is_evaluated(workspace) else workspace.without(BY_NAME["evaluate"])
+    return workspace if is_evaluated(workspace, memo) else workspace.without(BY_NAME["evaluate"])
 
 
 def outdated(workspace: Workspace, newest: Workspace) -> dict[str, tuple[Remark, ...]]:
