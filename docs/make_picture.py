@@ -1,5 +1,5 @@
 """Make the pictures of the documents: `python docs/make_picture.py flight WORKSPACE --view 1`,
-`orthophoto WORKSPACE`, `mesh WORKSPACE`, `report WORKSPACE`, or `viewer WORKSPACE`.
+`orthophoto WORKSPACE`, `mesh WORKSPACE`, `report WORKSPACE`, `viewer WORKSPACE`, or `tiles FOLDER`.
 
 `flight` needs an evaluated workspace, and shows this flight:
 
@@ -11,12 +11,17 @@
 `orthophoto` needs the rasters and `mesh` the mesh (`--deliver raster,mesh`); they show an orbit that is flown with
 `--images 30 --size 640x480 --seed 21` and run likewise. `report` needs the report of any workspace, as that of
 `make demo`, and `viewer` any trained one; both need Chromium. `mesh` needs the extras `mesh` and `simulator`.
+`tiles` opens a page of `export-tiles --cesium ../Cesium/` with CesiumJS in the folder beside it, as in
+docs/deliverables.md. The pictures of docs/real_flights.md are made by examples/flights/real_flights.py.
 """
 
 from __future__ import annotations
 
 import argparse
+import threading
 import time
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import cv2
@@ -166,6 +171,29 @@ def viewer_pages(workspace: Workspace) -> dict[str, np.ndarray]:
     return pictures
 
 
+def tiles_page(folder: Path) -> np.ndarray:
+    """Return the page of tiles in CesiumJS, BGR."""
+    from playwright.sync_api import sync_playwright
+
+    handler = partial(SimpleHTTPRequestHandler, directory=str(folder.absolute().parent))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium_path(), args=list(DRAWING))
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.goto(f"http://127.0.0.1:{server.server_port}/{folder.name}/")
+        page.evaluate(
+            "async () => { const { tileset } = await georef;"
+            " while (!tileset.tilesLoaded) await new Promise((next) => setTimeout(next, 500)); }"
+        )
+        time.sleep(20.0)  # without a graphics card, splats are sorted and drawn once in seconds
+        picture = decoded(page.screenshot(timeout=120_000))
+        browser.close()
+    server.shutdown()
+    server.server_close()
+    return picture
+
+
 def decoded(png: bytes) -> np.ndarray:
     """Return a picture (H, W, 3), BGR."""
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
@@ -182,8 +210,8 @@ def sized(picture: np.ndarray) -> np.ndarray:
 def main() -> None:
     """Write the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("picture", choices=["flight", "orthophoto", "mesh", "report", "viewer"])
-    parser.add_argument("workspace", type=Path)
+    parser.add_argument("picture", choices=["flight", "orthophoto", "mesh", "report", "viewer", "tiles"])
+    parser.add_argument("workspace", type=Path, help="workspace; for tiles, the folder with index.html")
     parser.add_argument("--view", type=int, default=0, help="number of the test view")
     options = parser.parse_args()
     IMAGES.mkdir(exist_ok=True)
@@ -196,6 +224,8 @@ def main() -> None:
         if not page.exists():
             raise SystemExit("no report there: run `georef report` on the workspace first")
         picture = parts_of_report(page)
+    elif options.picture == "tiles":
+        picture = sized(tiles_page(options.workspace))
     elif options.picture == "mesh":
         picture = mesh_from_sides(Workspace(options.workspace).path(MESH_GLB))
     elif options.picture == "orthophoto":
