@@ -80,7 +80,7 @@ COMMANDS: dict[str, HelpLine] = {
 TOGETHER = {"cluster": "Lend machines to a cluster: certificates, scheduler, worker."}
 
 
-def module_of(name: str) -> str:
+def command_module(name: str) -> str:
     """Return the module in `georef_cli.commands` that defines a command of the table."""
     return COMMANDS[name].module or name.replace("-", "_")
 
@@ -94,7 +94,7 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        found = importlib.import_module(f"georef_cli.commands.{module_of(cmd_name)}").command
+        found = importlib.import_module(f"georef_cli.commands.{command_module(cmd_name)}").command
         command = found if isinstance(found, Command) else found(cmd_name)
         assert isinstance(command, Command)
         return command

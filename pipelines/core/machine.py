@@ -1,4 +1,4 @@
-"""Number of threads that this process and its children use, and main memory, of the machine or of a container.
+"""Threads that this process and its children use, main memory, of the machine or of a container, and the cache.
 
 OpenMP, BLAS and numba read their variables when they are loaded. The limit is therefore set before the first stage
 is imported.
@@ -30,6 +30,13 @@ def thread_count() -> int:
 def chosen_threads(option: int) -> int:
     """Return the number of threads that a stage's option asks for; 0 and less stand for `thread_count`."""
     return option if option > 0 else thread_count()
+
+
+def user_cache() -> Path:
+    """Return the folder of what this program keeps for the user from run to run; it may not exist."""
+    import platformdirs
+
+    return platformdirs.user_cache_path("georefgs", appauthor=False)
 
 
 def available_cores() -> int:

@@ -12,11 +12,10 @@ from functools import cache
 from pathlib import Path
 
 import llvmlite.binding as llvm
-import platformdirs
 import torch
 
 from pipelines.core.files import replace_text
-from pipelines.core.machine import thread_count
+from pipelines.core.machine import thread_count, user_cache
 from pipelines.geometry.cameras import Pinhole
 from pipelines.jobs.costs import ITERATION_SECONDS, MEASURED_CORES
 from pipelines.splat.gaussians import Gaussians
@@ -45,7 +44,7 @@ def machine_factor() -> float:
 
 @cache
 def _factor(threads: int, key: str, compiled: bool) -> float:
-    file = platformdirs.user_cache_path("georefgs", appauthor=False) / "speed.json"
+    file = user_cache() / "speed.json"
     if (kept := _kept(file, key)) is not None:
         return kept
     if not compiled:

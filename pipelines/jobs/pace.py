@@ -14,10 +14,8 @@ import statistics
 from dataclasses import dataclass
 from pathlib import Path
 
-import platformdirs
-
 from pipelines.core.files import replace_text
-from pipelines.core.machine import thread_count
+from pipelines.core.machine import thread_count, user_cache
 
 log = logging.getLogger(__name__)
 
@@ -133,7 +131,7 @@ def _processor() -> str:
 
 
 def _file() -> Path:
-    return platformdirs.user_cache_path("georefgs", appauthor=False) / "pace.json"
+    return user_cache() / "pace.json"
 
 
 def _document() -> dict[str, dict[str, list[float]]]:

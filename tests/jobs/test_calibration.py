@@ -12,7 +12,7 @@ from pipelines.jobs import calibration
 
 def test_measured_once_and_again_only_for_other_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[float] = []
-    monkeypatch.setattr(calibration.platformdirs, "user_cache_path", lambda *_, **__: tmp_path / "cache")
+    monkeypatch.setattr(calibration, "user_cache", lambda: tmp_path / "cache")
     monkeypatch.setattr(calibration, "_processor_s", lambda: measured.append(1.0) or 1.0)
     factor = calibration._factor.__wrapped__
     slow = factor(2, "a 2", compiled=True)

@@ -10,7 +10,7 @@ from pipelines.jobs import pace
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(pace.platformdirs, "user_cache_path", lambda *_, **__: tmp_path / "cache")
+    monkeypatch.setattr(pace, "user_cache", lambda: tmp_path / "cache")
     return tmp_path / "cache" / "pace.json"
 
 
