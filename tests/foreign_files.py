@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipelines.formats.camera_files import Frame, lens_of, write_transforms
-from pipelines.geometry.cameras import full_parameters
+from pipelines.geometry.cameras import parameters_in
 from pipelines.geometry.sparse_model import SparseModel
 
 GL = np.diag([1.0, -1.0, -1.0])  # turns axes right, down, forward into right, up, backward
@@ -20,7 +20,9 @@ GL = np.diag([1.0, -1.0, -1.0])  # turns axes right, down, forward into right, u
 
 def _brown(model: SparseModel) -> tuple[float, ...]:
     """fx fy cx cy k1 k2 p1 p2 k3 of the only camera."""
-    return tuple(full_parameters(model.cameras[1]).tolist()[:9])
+    full = parameters_in(model.cameras[1], "FULL_OPENCV")
+    assert full is not None
+    return tuple(full.tolist()[:9])
 
 
 def _size(model: SparseModel) -> tuple[int, int]:

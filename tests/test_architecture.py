@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from georef_cli.main import COMMANDS, module_of
+from georef_cli.main import COMMANDS, command_module
 from pipelines.core.stages import PIPELINE
 
 REPOSITORY = Path(__file__).parents[1]
@@ -63,7 +63,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "click": ("georef_cli",),
     "rich": ("georef_cli",),
     "pyproj": ("pipelines.geodesy",),
-    "pycolmap": ("pipelines.sfm", "pipelines.formats"),
+    "pycolmap": ("pipelines.geometry.cameras",),
     "numba": ("pipelines.splat", "pipelines.surface"),
     "gsplat": ("pipelines.splat.rasterizer.cuda_kernels",),
     "torch": (
@@ -73,6 +73,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     ),
     "filelock": ("pipelines.core",),
     "psutil": ("pipelines.core.machine",),
+    "platformdirs": ("pipelines.core.machine",),
     "PIL": ("pipelines.formats.exif", "pipelines.formats.exif_writer"),
     "kornia": ("pipelines.sfm.learned_features",),
     "laspy": ("pipelines.formats",),
@@ -98,7 +99,7 @@ HOMES: dict[str, tuple[str, ...]] = {
 }
 # The entry point of a process whose log records go to its parent.
 CHILD = "pipelines.core.child"
-CORE_LIBRARIES = {"filelock", "numpy", "psutil", "pydantic"}
+CORE_LIBRARIES = {"filelock", "numpy", "platformdirs", "psutil", "pydantic"}
 
 
 def inside(module: str, room: str) -> bool:
@@ -284,7 +285,7 @@ def test_core_is_light() -> None:
 
 def test_building_the_commands_imports_nothing_heavy() -> None:
     """What a stage computes with is imported when it runs: `georef --help` and `status` answer at once."""
-    modules = [f"georef_cli.commands.{module_of(name)}" for name in COMMANDS]
+    modules = [f"georef_cli.commands.{command_module(name)}" for name in COMMANDS]
     code = f"import importlib, sys; [importlib.import_module(name) for name in {modules}]; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
     assert not {"torch", "pycolmap", "numba", "matplotlib", "scipy", "cv2", "pyproj"} & set(done.stdout.split())
@@ -293,7 +294,7 @@ def test_building_the_commands_imports_nothing_heavy() -> None:
 def test_table_of_commands_is_complete() -> None:
     """Every module in commands/ holds commands, and every command has its module."""
     modules = {path.stem for path in (REPOSITORY / "georef_cli/commands").glob("*.py")} - {"__init__"}
-    assert modules == set(map(module_of, COMMANDS))
+    assert modules == set(map(command_module, COMMANDS))
     assert {spec.name for spec in PIPELINE} <= set(COMMANDS)
 
 

@@ -12,6 +12,7 @@ reads position, yaw, pitch, roll and σ back, so that a table can be the input o
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,9 @@ from pipelines.core.files import replace_text
 from pipelines.core.products import dump_json
 from pipelines.core.types import FloatArray
 from pipelines.formats.tables import table_text
-from pipelines.geometry.cameras import Camera, distort, full_parameters, undistort
+from pipelines.geometry.cameras import RATIONAL_MODELS, Camera, distort, named_parameters, parameters_in, undistort
+from pipelines.geometry.lens_fit import FISHEYE, ForeignLens, nearest_camera
 
-FISHEYE = "OPENCV_FISHEYE"
 CAM_FROM_GL = np.diag([1.0, -1.0, -1.0])
 _LENS_SAMPLES = 25  # pixels along each side of an image that a lens is fitted to
 _METRES, _DEGREES, _ANGLE = "%.4f", "%.9f", "%.6f"  # 0.1 mm; 0.1 mm on the ground; 1 cm at 500 km
@@ -58,35 +59,48 @@ class Lens:
 def lens_of(camera: Camera) -> Lens:
     """Return the intrinsics of a camera in nerfstudio's terms.
 
-    A rational lens (FULL_OPENCV with k4, k5, k6) is replaced by the polynomial that least squares fits to it.
+    A lens that is none of OpenCV's polynomials is replaced by the one that least squares fits to it: a fisheye by
+    OPENCV_FISHEYE, a rational lens (FULL_OPENCV with k4, k5, k6) or any other by OPENCV with k3.
     """
-    fx, fy, cx, cy, *distortion = full_parameters(camera).tolist()
-    place = {"w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
-    k1, k2, p1, p2, k3, *rational = distortion
-    if camera.model == FISHEYE:
-        fisheye = dict(zip(("k1", "k2", "k3", "k4"), distortion[:4], strict=True))
-        return Lens(FISHEYE, {**place, **fisheye}, 0.0)
-    if not any(rational):
-        return Lens("OPENCV", {**place, "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2}, 0.0)
-    fitted, error = _polynomial(camera, np.array([fx, fy]), np.array([cx, cy]))
-    return Lens("OPENCV", {**place, **dict(zip(("k1", "k2", "k3", "p1", "p2"), fitted, strict=True))}, error)
+    named, error = named_parameters(camera), 0.0
+    place = {"w": camera.width, "h": camera.height, "fl_x": named["fx"], "fl_y": named["fy"]}
+    place |= {name: named[name] for name in ("cx", "cy")}
+    if camera.model.endswith("FISHEYE"):
+        same = parameters_in(camera, FISHEYE)
+        if same is None:
+            start = Camera(FISHEYE, camera.width, camera.height, np.array([*place.values()][2:] + [0.0] * 4))
+            fitted, error = nearest_camera(ForeignLens(start, partial(distort, camera)))
+            same = fitted.params
+        names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4")
+        return Lens(FISHEYE, {**place, **dict(zip(names, same.tolist(), strict=True))}, error)
+    terms = ("k1", "k2", "k3", "p1", "p2")
+    if camera.model in RATIONAL_MODELS and not any(named.get(name) for name in ("k4", "k5", "k6")):
+        return Lens("OPENCV", {**place, **{name: named.get(name, 0.0) for name in terms}}, 0.0)
+    fitted, error = _polynomial(camera, named)
+    return Lens("OPENCV", {**place, **dict(zip(("fl_x", "fl_y", *terms), fitted, strict=True))}, error)
 
 
-def _polynomial(camera: Camera, focal: FloatArray, center: FloatArray) -> tuple[list[float], float]:
-    """Return k1, k2, k3, p1, p2 of the polynomial nearest to a lens, and its largest error in pixels."""
+def _polynomial(camera: Camera, named: dict[str, float]) -> tuple[list[float], float]:
+    """Return fx, fy, k1, k2, k3, p1, p2 of the polynomial nearest to a lens, and its largest error in pixels."""
     x, y = (np.linspace(0.0, side, _LENS_SAMPLES) for side in (camera.width, camera.height))
     ray = undistort(camera, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     ray = ray[np.isfinite(ray).all(axis=1)]
     x, y = ray.T
-    r2 = x * x + y * y
+    r2, none = x * x + y * y, np.zeros(len(ray))
     powers = np.stack([r2, r2**2, r2**3], axis=-1)
-    by_x = np.column_stack([x[:, None] * powers, 2 * x * y, r2 + 2 * x * x]) * focal[0]
-    by_y = np.column_stack([y[:, None] * powers, r2 + 2 * y * y, 2 * x * y]) * focal[1]
-    bent = distort(camera, ray) - center - focal * ray
-    design, target = np.concatenate([by_x, by_y]), np.concatenate([bent[:, 0], bent[:, 1]])
-    solution = np.linalg.lstsq(design, target, rcond=None)[0]
-    error = (design @ solution - target).reshape(2, -1)
-    return solution.tolist(), float(np.hypot(*error).max())
+    # Linear in fx, fy, and the other terms times their mean.
+    by_x = np.column_stack([x, none, x[:, None] * powers, 2 * x * y, r2 + 2 * x * x])
+    by_y = np.column_stack([none, y, y[:, None] * powers, r2 + 2 * y * y, 2 * x * y])
+    design = np.concatenate([by_x * named["fx"], by_y * named["fy"]])
+    target = (distort(camera, ray) - [named["cx"], named["cy"]]).T.ravel()
+    gain_x, gain_y, *terms = np.linalg.lstsq(design, target, rcond=None)[0].tolist()
+    # The terms are multiplied by the fitted focal lengths where the file is read.
+    gain = (gain_x + gain_y) / 2
+    fitted = [gain_x * named["fx"], gain_y * named["fy"], *(term / gain for term in terms)]
+    solution = np.array([gain_x, gain_y, *(term / gain for term in terms)])
+    scale = np.repeat([gain_x, gain_y], len(ray))
+    error = design[:, :2] @ solution[:2] + scale * (design[:, 2:] @ solution[2:]) - target
+    return fitted, float(np.hypot(*error.reshape(2, -1)).max())
 
 
 def write_transforms(path: Path, frames: Sequence[Frame], lenses: Sequence[Lens], points: str) -> None:

@@ -8,9 +8,7 @@ and `reconstruction_io_text.cc` of COLMAP 4.
 from __future__ import annotations
 
 import mmap
-import signal
 import struct
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -27,7 +25,7 @@ from pipelines.core.types import FloatArray, IntArray, Vector3
 from pipelines.core.validators import stays_inside
 from pipelines.formats.colmap_text import check_images_text
 from pipelines.formats.colmap_values import check_lenses, check_quaternions_text, quaternion_fault
-from pipelines.geometry.cameras import Camera
+from pipelines.geometry.cameras import Camera, pycolmap_module
 from pipelines.geometry.sparse_model import SparseModel
 
 ROLLING_SHUTTER = "rolling_shutter.json"
@@ -224,20 +222,6 @@ def flatten(reconstruction: Any) -> SparseModel:
         obs_image=obs_image,
         obs_xy_px=obs_xy,
     )
-
-
-def pycolmap_module() -> Any:
-    """Return pycolmap, imported so that the process's signals stay as they are.
-
-    On import, pycolmap handles SIGTERM by a stack trace and the end of the process: an interrupted stage would not
-    end cleanly.
-    """
-    import pycolmap
-
-    if threading.current_thread() is threading.main_thread():
-        handler = signal.getsignal(signal.SIGTERM)  # Python's own record, which the import has not changed
-        signal.signal(signal.SIGTERM, signal.SIG_DFL if handler is None else handler)
-    return pycolmap
 
 
 @contextmanager

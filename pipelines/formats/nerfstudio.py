@@ -14,9 +14,9 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json
-from pipelines.formats.camera_files import CAM_FROM_GL, FISHEYE
+from pipelines.formats.camera_files import CAM_FROM_GL
 from pipelines.formats.solved_cameras import Foreign, PhotoSize, SolvedCameras, SolvedPhotograph, solved_cameras
-from pipelines.geometry.lens_fit import Brown, ForeignLens, brown_lens, fisheye_lens
+from pipelines.geometry.lens_fit import FISHEYE, Brown, ForeignLens, brown_lens, fisheye_lens
 
 PROGRAM = "nerfstudio"
 _PERSPECTIVE = frozenset({"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"})

@@ -1,16 +1,18 @@
-"""Cameras with lens distortion: pixels ↔ rays, for COLMAP's camera models.
+"""Cameras with lens distortion: pixels ↔ rays, by COLMAP's camera models.
 
 Pixels have the centre of the top-left pixel at (0.5, 0.5). Rays are normalised coordinates (x/z, y/z) in the
-camera frame: x right, y down, z forward. Every model is brought into one of two forms, OpenCV's rational lens
-(FULL_OPENCV, of which the simpler models are special cases) or the equidistant fisheye. `Lenses` holds the cameras
-of all images with their parameters as one vector, which an adjustment changes.
+camera frame: x right, y down, z forward. The models are those of COLMAP's library. `Lenses` holds the cameras of
+all images with their parameters as one vector, which an adjustment changes.
 """
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,23 +20,49 @@ from numpy.typing import ArrayLike
 from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 
-# Slots of each of COLMAP's parameters: fx fy cx cy | k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4).
-_LAYOUT: dict[str, tuple[tuple[int, ...], ...]] = {
-    "SIMPLE_PINHOLE": ((0, 1), (2,), (3,)),
-    "PINHOLE": ((0,), (1,), (2,), (3,)),
-    "SIMPLE_RADIAL": ((0, 1), (2,), (3,), (4,)),
-    "RADIAL": ((0, 1), (2,), (3,), (4,), (5,)),
-    "OPENCV": tuple((slot,) for slot in range(8)),
-    "FULL_OPENCV": tuple((slot,) for slot in range(12)),
-    "OPENCV_FISHEYE": tuple((slot,) for slot in range(8)),
+# Parameters of COLMAP's camera models in its order; `f` is the focal length of both axes. Its panoramas have none.
+_PARAMETERS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "SIMPLE_FISHEYE": "f cx cy",
+    "FISHEYE": "fx fy cx cy",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
+    "RAD_TAN_THIN_PRISM_FISHEYE": "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
+    "FOV": "fx fy cx cy omega",
+    "SIMPLE_DIVISION": "f cx cy k",
+    "DIVISION": "fx fy cx cy k",
+    "EUCM": "fx fy cx cy alpha beta",
 }
-MODELS = tuple(_LAYOUT)
-_SLOT_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_FISHEYE_SLOT_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+MODELS = tuple(_PARAMETERS)
+# Models of one family are special cases of its last.
+RATIONAL_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+FISHEYE_MODELS = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 LENGTHS = frozenset({"f", "fx", "fy", "cx", "cy"})  # parameters in pixels; all others have no unit
 
-_MAX_NEWTON_STEPS = 30
-_TOLERANCE = 1e-11  # of normalised coordinates: 1e-8 px at f = 1000 px
+_MISSED_PX = (
+    1e-3  # between a pixel and its ray's, beyond which the ray is another's; COLMAP's iteration leaves 1e-6
+)
+
+
+def pycolmap_module() -> Any:
+    """Return pycolmap, imported so that the process's signals stay as they are.
+
+    On import, pycolmap handles SIGTERM by a stack trace and the end of the process: an interrupted stage would not
+    end cleanly.
+    """
+    import pycolmap
+
+    if threading.current_thread() is threading.main_thread():
+        handler = signal.getsignal(signal.SIGTERM)  # Python's own record, which the import has not changed
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if handler is None else handler)
+    return pycolmap
 
 
 @dataclass(frozen=True)
@@ -111,49 +139,76 @@ class Camera:
 
     @property
     def mean_focal_px(self) -> float:
-        return float(full_parameters(self)[:2].mean())
+        return float(focal_and_center(self)[:2].mean())
 
 
 def parameter_names(camera: Camera) -> tuple[str, ...]:
-    """Return the names of a camera's parameters in COLMAP's order; `f` is the focal length of both axes."""
-    names = _FISHEYE_SLOT_NAMES if _is_fisheye(camera) else _SLOT_NAMES
-    return tuple("f" if len(slots) > 1 else names[slots[0]] for slots in _LAYOUT[camera.model])
+    """Return the names of a camera's parameters in COLMAP's order; `f` is the focal length of both axes.
+
+    Raises:
+        InputError: unknown camera model, a wrong number of parameters, or a focal length that is not positive.
+    """
+    listed = _PARAMETERS.get(camera.model)
+    if listed is None:
+        message = f"The camera model {camera.model} is not supported. Use one of {', '.join(MODELS)}."
+        raise InputError("camera-model-unknown", message)
+    names = tuple(listed.split())
+    if len(camera.params) != len(names):
+        message = f"The camera model {camera.model} has {len(names)} parameters, not {len(camera.params)}."
+        raise InputError("camera-parameters", message)
+    for name, value in zip(names, camera.params, strict=True):
+        if name.startswith("f") and not value > 0:
+            raise InputError("focal-length", f"The focal length of {value:g} px is not positive.")
+    return names
+
+
+def named_parameters(camera: Camera) -> dict[str, float]:
+    """Return a camera's parameters by name, `fx` and `fy` in place of `f`; raises as `parameter_names`."""
+    named = dict(zip(parameter_names(camera), camera.params.tolist(), strict=True))
+    focal = named.pop("f", None)
+    return named if focal is None else {"fx": focal, "fy": focal, **named}
+
+
+def focal_and_center(camera: Camera) -> FloatArray:
+    """Return fx, fy, cx, cy in pixels; raises as `parameter_names`."""
+    named = named_parameters(camera)
+    return np.array([named[name] for name in ("fx", "fy", "cx", "cy")])
 
 
 def parameters_in(camera: Camera, model: str) -> FloatArray | None:
-    """Return a camera's parameters in the order of another model; None between a fisheye and other lenses.
+    """Return a camera's parameters in the order of another model; None between lenses of two families.
 
-    What the other model lacks is dropped, and what it has besides is zero. Raises as `undistort`.
+    What the other model lacks is dropped, and what it has besides is zero. Raises as `parameter_names`.
     """
-    full = full_parameters(camera)
-    if _is_fisheye(camera) != (model == "OPENCV_FISHEYE"):
+    if camera.model != model and not any(
+        {camera.model, model} <= set(family) for family in (RATIONAL_MODELS, FISHEYE_MODELS)
+    ):
         return None
-    return np.asarray(full[[slots[0] for slots in _LAYOUT[model]]])
+    named = named_parameters(camera)
+    return np.array([named["fx"] if name == "f" else named.get(name, 0.0) for name in _PARAMETERS[model].split()])
 
 
 def undistort(camera: Camera, xy_px: ArrayLike) -> FloatArray:
     """Return rays (…, 2) as (x/z, y/z) of pixels (…, 2); NaN where the lens model maps no ray to the pixel.
 
-    Newton's method inverts the distortion, with its analytic derivative. A solution beyond the fold of the radial
-    polynomial (where the polynomial stops being one to one) is refused.
-
     Raises:
-        InputError: unknown camera model, or a wrong number of parameters.
+        InputError: unknown camera model, a wrong number of parameters, or a focal length that is not positive.
     """
-    focal, center, distortion = np.split(full_parameters(camera), [2, 4])
-    target = (np.asarray(xy_px, dtype=np.float64) - center) / focal
-    if not distortion.any() and camera.model != "OPENCV_FISHEYE":
-        return target
-    flat = target.reshape(-1, 2)
-    rays = _undistort_fisheye(flat, distortion) if _is_fisheye(camera) else _undistort_rational(flat, distortion)
-    return rays.reshape(target.shape)
+    pixel = np.asarray(xy_px, dtype=np.float64)
+    flat, lens = pixel.reshape(-1, 2), _colmap_camera(camera)
+    ray = np.array(lens.cam_from_img(flat)).reshape(-1, 2)
+    # Of a pixel at 90° or more from the axis, which no (x/z, y/z) has, COLMAP returns some other ray.
+    missed = ~(np.abs(lens.img_from_cam(_ahead(ray)) - flat) <= _MISSED_PX).all(axis=1)
+    ray[missed] = np.nan
+    return ray.reshape(pixel.shape)
 
 
 def project(camera: Camera, point_in_cam: ArrayLike) -> FloatArray:
     """Return pixels (…, 2) of points (…, 3) in the camera frame; NaN behind the camera; raises as `undistort`."""
     point = np.asarray(point_in_cam, dtype=np.float64)
-    depth = np.where(point[..., 2:] > 0, point[..., 2:], np.nan)
-    return distort(camera, point[..., :2] / depth)
+    pixel = np.array(_colmap_camera(camera).img_from_cam(point.reshape(-1, 3))).reshape(*point.shape[:-1], 2)
+    pixel[~(point[..., 2] > 0)] = np.nan
+    return pixel
 
 
 def project_each(cameras: dict[int, Camera], camera_of: IntArray, points_in_cam: FloatArray) -> FloatArray:
@@ -167,98 +222,19 @@ def project_each(cameras: dict[int, Camera], camera_of: IntArray, points_in_cam:
 
 def distort(camera: Camera, ray: ArrayLike) -> FloatArray:
     """Return pixels (…, 2) of rays (…, 2) given as (x/z, y/z); raises as `undistort`."""
-    focal, center, distortion = np.split(full_parameters(camera), [2, 4])
-    normalised = np.asarray(ray, dtype=np.float64)
-    flat = normalised.reshape(-1, 2)
-    bent = _distort_fisheye(flat, distortion) if _is_fisheye(camera) else _distort_rational(flat, distortion)[0]
-    return bent.reshape(normalised.shape) * focal + center
+    return project(camera, _ahead(np.asarray(ray, dtype=np.float64)))
 
 
-def _is_fisheye(camera: Camera) -> bool:
-    return camera.model == "OPENCV_FISHEYE"
+def _ahead(ray: FloatArray) -> FloatArray:
+    """Return the points (…, 3) of rays (…, 2) at z = 1."""
+    return np.concatenate([ray, np.ones((*ray.shape[:-1], 1))], axis=-1)
 
 
-def full_parameters(camera: Camera) -> FloatArray:
-    """Return fx fy cx cy, then k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4), zero for terms that the model lacks.
-
-    Raises as `undistort`.
-    """
-    layout = _LAYOUT.get(camera.model)
-    if layout is None:
-        message = f"The camera model {camera.model} is not supported. Use one of {', '.join(MODELS)}."
-        raise InputError("camera-model-unknown", message)
-    if len(camera.params) != len(layout):
-        message = f"The camera model {camera.model} has {len(layout)} parameters, not {len(camera.params)}."
-        raise InputError("camera-parameters", message)
-    full = np.zeros(12)
-    for value, slots in zip(camera.params, layout, strict=True):
-        full[list(slots)] = value
-    if not (full[:2] > 0).all():
-        raise InputError("focal-length", f"The focal length of {full[0]:g} px is not positive.")
-    return full
-
-
-def _distort_rational(ray: FloatArray, lens: FloatArray) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-    """Return distorted rays (N, 2) and the derivative's entries (du/dx, du/dy = dv/dx, dv/dy), each (N,)."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = lens
-    x, y = ray[:, 0], ray[:, 1]
-    r2 = x * x + y * y
-    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    gain = numerator / denominator
-    slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - gain * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
-    u = x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    v = y * gain + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-    du_dx = gain + 2 * slope * x * x + 2 * p1 * y + 6 * p2 * x
-    dv_dy = gain + 2 * slope * y * y + 2 * p2 * x + 6 * p1 * y
-    mixed = 2 * slope * x * y + 2 * p1 * x + 2 * p2 * y
-    return np.stack([u, v], axis=-1), (du_dx, mixed, dv_dy)
-
-
-def _undistort_rational(target: FloatArray, lens: FloatArray) -> FloatArray:
-    ray = target.copy()
-    with np.errstate(all="ignore"):
-        for _ in range(_MAX_NEWTON_STEPS):
-            bent, (a, b, c) = _distort_rational(ray, lens)
-            residual = target - bent
-            if not (np.abs(residual) > _TOLERANCE).any():
-                break
-            determinant = a * c - b * b
-            ray[:, 0] += (c * residual[:, 0] - b * residual[:, 1]) / determinant
-            ray[:, 1] += (a * residual[:, 1] - b * residual[:, 0]) / determinant
-        bent, (a, b, c) = _distort_rational(ray, lens)
-        solved = (np.abs(target - bent) <= 10 * _TOLERANCE).all(axis=1) & (a * c - b * b > 0) & (a + c > 0)
-    return np.where(solved[:, None], ray, np.nan)
-
-
-def _fisheye_angle(theta: FloatArray, lens: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the distorted angle and its derivative; `lens` holds k1 … k4."""
-    t2 = theta * theta
-    k1, k2, k3, k4 = lens[:4]
-    bent = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-    return bent, 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-
-
-def _distort_fisheye(ray: FloatArray, lens: FloatArray) -> FloatArray:
-    radius = np.hypot(ray[:, 0], ray[:, 1])
-    bent, _ = _fisheye_angle(np.arctan(radius), lens)
-    return ray * np.where(radius > 1e-12, bent / np.maximum(radius, 1e-12), 1.0)[:, None]
-
-
-def _undistort_fisheye(target: FloatArray, lens: FloatArray) -> FloatArray:
-    bent = np.hypot(target[:, 0], target[:, 1])
-    theta = np.minimum(bent, 1.5)
-    with np.errstate(all="ignore"):
-        for _ in range(_MAX_NEWTON_STEPS):
-            value, slope = _fisheye_angle(theta, lens)
-            if not (np.abs(value - bent) > _TOLERANCE).any():
-                break
-            theta = theta + (bent - value) / slope
-        value, slope = _fisheye_angle(theta, lens)
-        # A ray at or beyond 90° has no (x/z, y/z).
-        solved = (np.abs(value - bent) <= 10 * _TOLERANCE) & (slope > 0) & (theta >= 0) & (theta < np.pi / 2)
-        stretch = np.where(bent > 1e-12, np.tan(theta) / np.maximum(bent, 1e-12), 1.0)
-    return np.where(solved[:, None], target * stretch[:, None], np.nan)
+def _colmap_camera(camera: Camera) -> Any:
+    """Return COLMAP's own camera; raises as `parameter_names`."""
+    parameter_names(camera)
+    size = {"width": camera.width, "height": camera.height}
+    return pycolmap_module().Camera(model=camera.model, params=camera.params, **size)
 
 
 @dataclass(frozen=True)
@@ -310,15 +286,35 @@ class Lenses:
         return change.ravel()
 
     def bearing_jacobian(self, image: IntArray, xy_px: FloatArray) -> FloatArray:
-        """Return the derivatives (K, 3, L) of `bearings` of pixels (K, 2) in images (K,) by all parameters."""
+        """Return the derivatives (K, 3, L) of `bearings` of pixels (K, 2) in images (K,) by all parameters.
+
+        The ray of a pixel moves against the pixel of the ray: ∂ray/∂p = −(∂pixel/∂ray)⁻¹ ∂pixel/∂p.
+        """
         image, longest = np.asarray(image, dtype=np.int64), self.longest
         jacobian = np.zeros((len(image), 3, len(self.cameras), longest))
         for slot, (key, camera) in enumerate(self.cameras.items()):
             rows = np.flatnonzero(self.camera_id[image] == key)
+            ray = undistort(camera, xy_px[rows])
+            a, b, c, d = _pixel_by_ray(camera, ray)
+            determinant = a * d - b * c
+            bearing = _ahead(ray)
+            length = np.linalg.norm(bearing, axis=1, keepdims=True)
+            bearing /= length
             for index in range(len(camera.params)):
-                bearings_of = partial(bearings, xy_px=xy_px[rows])
-                jacobian[rows, :, slot, index] = parameter_derivative(bearings_of, camera, index, _STEP)
+                u, v = parameter_derivative(partial(distort, ray=ray), camera, index, _STEP).T
+                moved = np.column_stack([b * v - d * u, c * u - a * v, np.zeros(len(ray))]) / determinant[:, None]
+                along = (bearing * moved).sum(axis=1, keepdims=True)
+                jacobian[rows, :, slot, index] = (moved - along * bearing) / length
         return jacobian.reshape(len(image), 3, -1)
+
+
+def _pixel_by_ray(camera: Camera, ray: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the derivatives (K,) ∂u/∂x, ∂u/∂y, ∂v/∂x, ∂v/∂y of the pixels (u, v) of rays (K, 2)."""
+    by_x, by_y = (
+        (distort(camera, ray + _STEP * axis) - distort(camera, ray - _STEP * axis)) / (2 * _STEP)
+        for axis in np.eye(2)
+    )
+    return by_x[:, 0], by_y[:, 0], by_x[:, 1], by_y[:, 1]
 
 
 def parameter_derivative(
@@ -336,8 +332,7 @@ def parameter_derivative(
 
 def bearings(camera: Camera, xy_px: FloatArray) -> FloatArray:
     """Return unit vectors (K, 3) in the camera's frame towards pixels (K, 2); NaN as in `undistort`."""
-    ray = undistort(camera, xy_px)
-    ray = np.concatenate([ray, np.ones((len(ray), 1))], axis=1)
+    ray = _ahead(undistort(camera, xy_px))
     return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
 
 

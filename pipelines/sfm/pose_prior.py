@@ -24,13 +24,8 @@ from pipelines.core.progress import Progress
 from pipelines.core.stages import ADJUSTMENT, SIM3, SIM3_POSTERIOR, SPARSE
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.formats.colmap import (
-    load_reconstruction,
-    pycolmap_module,
-    quiet_colmap,
-    read_sparse,
-    write_reconstruction,
-)
+from pipelines.formats.colmap import load_reconstruction, quiet_colmap, read_sparse, write_reconstruction
+from pipelines.geometry.cameras import pycolmap_module
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.robust.statistics import residual_stats

@@ -21,7 +21,7 @@ from pipelines.core.files import replacing
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
 from pipelines.formats.image_file import read_bytes, require_unchanged
-from pipelines.geometry.cameras import Camera, Lenses, Pinhole, distort, full_parameters, refit_pinhole, undistort
+from pipelines.geometry.cameras import Camera, Lenses, Pinhole, distort, focal_and_center, refit_pinhole, undistort
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ def pinhole_of(camera: Camera, max_size_px: int) -> Pinhole:
 
     The focal length is scaled with the size. Distortion parameters are dropped.
     """
-    fx, fy, cx, cy = full_parameters(camera)[:4]
+    fx, fy, cx, cy = focal_and_center(camera).tolist()
     return Pinhole(camera.width, camera.height, fx, fy, cx, cy).limited(max_size_px)
 
 
