@@ -24,7 +24,7 @@ from pipelines.deliver.options import ExportRasterOptions
 from pipelines.deliver.photo_colours import PhotoColours
 from pipelines.deliver.placement import median_values, require_space, scene_sigma
 from pipelines.deliver.raster_mosaic import Mosaic
-from pipelines.deliver.raster_plan import ground_sampling_m, make_frame
+from pipelines.deliver.raster_plan import make_frame, training_pixel_m
 from pipelines.deliver.raster_window import RasterSource, raster_source
 from pipelines.deliver.surface import without_sigma
 from pipelines.formats.georef_sidecar import CrsSidecar, median_sigma, write_sidecar
@@ -32,6 +32,7 @@ from pipelines.formats.geotiff import RasterFrame, read_reduced
 from pipelines.formats.vector_files import ContourLine, features_text, write_contours_dxf, write_contours_gpkg
 from pipelines.geometry.relief import pale, sunlight
 from pipelines.surface.measured_area import area_of
+from pipelines.survey.area import ground_sampling_m
 from pipelines.survey.headline import headline_of
 from pipelines.survey.scene import photographs
 from pipelines.survey.target_crs import TargetCrs, target_crs
@@ -54,16 +55,17 @@ _CONTOUR_PX = 6000  # of the surface that lines are drawn of
 def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     """Write rasters, pictures and contours, return their figures; a DegenerateGeometryError: no cell was seen."""
     trained = load_trained(stage.workspace)
-    points, gsd_m = scene_points(trained), ground_sampling_m(trained)
+    points, gsd_m, training_gsd_m = scene_points(trained), ground_sampling_m(trained), training_pixel_m(trained)
+    assert gsd_m is not None  # a training has points
     target = target_crs(options, trained.survey.origin, corners(points), trained.survey.vertical)
     area = area_of(options, trained, stage.workspace, stage.progress)
     polygon = area.in_crs(target)
-    frame = make_frame(polygon.bounds, target, gsd_m[0], options)
+    frame = make_frame(polygon.bounds, target, gsd_m, options)
     size = f"{frame.columns} × {frame.rows} cells"
     needed_bytes = _BYTES_PER_CELL * frame.columns * frame.rows
     require_space(stage.out, needed_bytes, f"rasters of {size}", "give a larger --gsd")
     source, reason, warnings = raster_source(
-        stage, trained, target, frame, area, training_gsd_m=gsd_m[1], options=options
+        stage, trained, target, frame, area, training_gsd_m=training_gsd_m, options=options
     )
     mosaic = Mosaic(
         stage.out / "parts", frame, target, polygon,
@@ -94,8 +96,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         "columns": frame.columns,
         "rows": frame.rows,
         "gsd": frame.step_x,
-        "gsd_photographs_m": gsd_m[0],
-        "gsd_training_m": gsd_m[1],
+        "gsd_photographs_m": gsd_m,
+        "gsd_training_m": training_gsd_m,
         "crs": target.crs.name,
         "heights": target.crs.vertical.name,
         "units": target.crs.units,

@@ -34,13 +34,13 @@ _DILATION_PX2 = 0.3  # of the training, in its pixels
 _LARGEST_DEG = 0.01  # about a kilometre
 
 
-def ground_sampling_m(trained: TrainedSurvey) -> tuple[float, float]:
-    """Return the ground sample distances of the photographs, and at the size at which the model was trained."""
+def training_pixel_m(trained: TrainedSurvey) -> float:
+    """Return the median size at the SfM points of a pixel of the photographs as the model was trained with them."""
     depth_m, focal_px = depths_of_observations(trained)
     cameras = [trained.sparse.camera_of(index) for index in range(len(trained.sfm.image_name))]
     longest_px = np.array([max(camera.width, camera.height) for camera in cameras])
     reduced = np.maximum(longest_px / trained.model.max_image_size, 1.0)[trained.sfm.obs_image]
-    return float(np.median(depth_m / focal_px)), float(np.median(depth_m / focal_px * reduced))
+    return float(np.median(depth_m / focal_px * reduced))
 
 
 def make_frame(

@@ -30,6 +30,7 @@ from pipelines.report.page import (
 from pipelines.report.place import OverlapFacts
 from pipelines.report.plots.maps import RasterPlace, raster_map
 from pipelines.report.views import EvaluatedSurvey
+from pipelines.survey.area import ground_sampling_m
 
 _NOTES = {
     "measured": "RMSE of the triangulated check points, their survey's error included",
@@ -70,7 +71,7 @@ def cover_facts(
     elif report.area_measured is not None:
         area += f", {report.area_measured:.0%} of it measured"
     surface = report.headline.surface
-    height_m, gsd_m = flying_height_m(evaluated), ground_sampling_m(evaluated)
+    height_m, gsd_m = flying_height_m(evaluated), ground_sampling_m(evaluated.solved)
     previews = {"Orthophoto": ORTHOPHOTO_PREVIEW, "Surface model": HILLSHADE}
     shown = {name: _raster_picture(evaluated.workspace, name, product) for name, product in previews.items()}
     registered = f"{count_text(lenses.photographs)} of {count_text(len(survey.images))} registered"
@@ -138,14 +139,6 @@ def flying_height_m(evaluated: EvaluatedSurvey) -> float | None:
     """Return the median height of the photographs above the surface below them; None: there is no surface."""
     center, surface = evaluated.center_in_geo, evaluated.surface
     return None if surface is None else float(np.median(center[:, 2] - surface.heights(center[:, :2])))
-
-
-def ground_sampling_m(evaluated: EvaluatedSurvey) -> float | None:
-    """Return the median size of a pixel at the SfM points, depth over focal length; None: no observations."""
-    solved = evaluated.solved
-    depth = evaluated.ray_in_cam[:, 2] * solved.geo_from_model.scale
-    focal_px = solved.sparse.focal_px[evaluated.network.obs_image]
-    return float(np.median(depth / focal_px)) if len(depth) else None
 
 
 def days_of(times_s: Iterable[float | None]) -> str:

@@ -196,6 +196,12 @@ def depths_of_observations(solved: SolvedSurvey) -> tuple[FloatArray, FloatArray
     return solved.geo_from_model.scale * depth, solved.sparse.focal_px[sfm.obs_image]
 
 
+def ground_sampling_m(solved: SolvedSurvey) -> float | None:
+    """Return the ground sampling distance, the median of a pixel's size at the SfM points; None: no points."""
+    depth_m, focal_px = depths_of_observations(solved)
+    return float(np.median(depth_m / focal_px)) if len(depth_m) else None
+
+
 def photographs_that_see(solved: SolvedSurvey, point_in_geo: FloatArray, coarsest_m: float = np.inf) -> IntArray:
     """Return the number (K,) of registered photographs whose frame holds points (K, 3); nothing hides a point.
 

@@ -18,13 +18,13 @@ from pipelines.core.stages import SURVEY
 from pipelines.geometry.bundle import correction_basis
 from pipelines.report.accuracy import ninety_percent
 from pipelines.report.cameras import bias_of, cameras_facts, lenses_facts, mean_by_region
-from pipelines.report.cover import cover_facts, days_of, flying_height_m, ground_sampling_m
+from pipelines.report.cover import cover_facts, days_of, flying_height_m
 from pipelines.report.options import ReportOptions
 from pipelines.report.place import links_of, overlap_facts, ties_of
 from pipelines.report.points import cut_chips, points_facts
 from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, level_of, verdicts
 from pipelines.report.views import read_metrics
-from pipelines.survey.area import photographs_that_see
+from pipelines.survey.area import ground_sampling_m, photographs_that_see
 from pipelines.survey.report import ByAxis, DistanceError, PointError, PredictedSigma, SurfaceHeight
 from pipelines.survey.report_parts import VarianceFactor
 from pipelines.survey.survey import LOCAL_FRAME, Survey
@@ -331,7 +331,7 @@ def test_verdicts_are_given_on_what_there_is() -> None:
 def test_facts_of_the_cover_are_those_of_the_flight(reported: Reported) -> None:
     scene, survey = reported.truth.scene, reported.survey
     above_m = scene.center_in_geo[:, 2].mean() - np.median(scene.point_in_geo[:, 2])
-    height_m, gsd_m = flying_height_m(survey), ground_sampling_m(survey)
+    height_m, gsd_m = flying_height_m(survey), ground_sampling_m(survey.solved)
     assert height_m is not None and gsd_m is not None
     assert height_m == pytest.approx(above_m, abs=float(np.ptp(scene.point_in_geo[:, 2])))
     owner, image, _ = scene.pixels(scene.point_in_geo)
