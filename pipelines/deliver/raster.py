@@ -67,9 +67,10 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     source, reason, warnings = raster_source(
         stage, trained, target, frame, area, training_gsd_m=training_gsd_m, options=options
     )
+    fill = options.fill if area.is_outline or options.fill == 0 else "all"
     mosaic = Mosaic(
         stage.out / "parts", frame, target, polygon,
-        has_terrain=source.terrain is not None, interpolates=options.fill != 0,
+        has_terrain=source.terrain is not None, fill=fill, photo_m=gsd_m,
     )  # fmt: skip
     mosaic.render(source, stage.progress)
     if options.colours == "photographs":

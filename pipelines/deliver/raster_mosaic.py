@@ -32,6 +32,8 @@ from pipelines.formats.geotiff import (
 )
 from pipelines.formats.vector_files import Json, feature
 from pipelines.surface.filling import fill_cells
+from pipelines.survey.measured_ground import MeasuredGround
+from pipelines.survey.options import FillWidth
 from pipelines.survey.target_crs import TargetCrs
 
 _SEEN = ("orthophoto", "dsm", "modelled", "sigma_h", "sigma_v")  # parts of what is measured
@@ -62,8 +64,10 @@ class _Window:
 class Mosaic:
     """Rasters over one frame, and the area (a polygon in their CRS) outside which they are empty.
 
-    They are whole inside it, or, if nothing is to be interpolated, where they are measured. Parts in the folder are
-    kept: `parts` of what is measured, `whole` of the rasters to deliver.
+    They are whole inside it with `fill` "all". Else they end where their own measured cells do, which know more
+    than the area: holes up to a width of `fill` metres are filled, or, if it is None, those that
+    `MeasuredGround.outline` fills where pixels of the photographs are `photo_m` wide. Parts in the folder are kept:
+    `parts` of what is measured, `whole` of the rasters to deliver.
     """
 
     def __init__(
@@ -74,10 +78,11 @@ class Mosaic:
         polygon: Any,
         *,
         has_terrain: bool,
-        interpolates: bool = True,
+        fill: FillWidth | None,
+        photo_m: float,
     ) -> None:
         self.folder, self.frame, self.target, self.polygon = folder, frame, target, polygon
-        self._interpolates = interpolates
+        self._fill, self._photo_m = fill, photo_m
         height = f"height above {target.crs.vertical.name}"
         self._kinds = {
             "orthophoto": RasterKind("uint8", _COLOURS),
@@ -110,6 +115,8 @@ class Mosaic:
                     self._write(self._seen, window, dict(zip(_SEEN, bands, strict=True)))
                 task.advance()
         self._drop_islands()
+        if self._fill != "all":
+            self.polygon = self._outline(self._fill)
         for name in ("orthophoto", "dsm", "modelled"):
             parts = [(self._part(self._seen, name, one), one.column, one.row) for one in windows]
             write_vrt(name, parts, self.frame, self._kinds["dsm" if name == "modelled" else name], {})
@@ -165,6 +172,26 @@ class Mosaic:
             np.logical_or.at(seen, _coarse_cells(window, step), alpha == MEASURED)
         return seen
 
+    def _outline(self, fill: float | None) -> Any:
+        """Return the polygon of what is measured in the area, with holes up to a width; all where nothing is."""
+        step_x, step_y = self._step * self.frame.step_x, self._step * self.frame.step_y
+        cell_m = step_x * self.target.horizontal_unit_m
+        seen = self._measured()
+
+        def plan_in_m(plan: FloatArray) -> FloatArray:
+            east, north = (plan[:, 0] - self.frame.west) / step_x, (plan[:, 1] - self.frame.north) / step_y
+            return np.column_stack([cell_m * east, cell_m * (len(seen) + north)])
+
+        def plan_of_m(plan: FloatArray) -> FloatArray:
+            east, north = (plan / cell_m).T
+            return np.column_stack(
+                [self.frame.west + step_x * east, self.frame.north + step_y * (north - len(seen))]
+            )
+
+        ground = MeasuredGround(seen[::-1], np.zeros(2), np.array([cell_m, self._photo_m]))
+        outline = ground.outline(shapely.transform(self.polygon, plan_in_m), fill)
+        return self.polygon if outline is None else shapely.transform(outline, plan_of_m)
+
     def _drop_islands(self) -> None:
         """Unmeasure the cells of islands: small parts, apart from all other surface, are agreements by chance."""
         step, seen = self._step, self._measured()
@@ -192,7 +219,7 @@ class Mosaic:
             read_cells(self._seen / "dsm.vrt", part)[0].astype(np.float64),
             cells_inside(self.polygon, frame),
         )
-        if not self._interpolates:
+        if self._fill == 0:
             inside &= np.isfinite(height)
         return SeenCells(
             frame=frame,

@@ -76,9 +76,8 @@ def area_of(
             )  # fmt: skip
         else:
             source = f"ground that {LEAST_PHOTOGRAPHS} training views measure"
-            whole = replace(
-                whole, polygon=outline, source=source if stated is None else f"{source} in {whole.source}"
-            )
+            source = source if stated is None else f"{source} in {whole.source}"
+            whole = replace(whole, polygon=outline, source=source, is_outline=True)
     return replace(whole, measured=ground.share(whole.polygon))
 
 

@@ -44,6 +44,7 @@ class Area:
     level_m: float
     source: str  # file of the boundary, or whence the area is known
     measured: float | None = None  # share of it that the training views measure; None: there is no trained model
+    is_outline: bool = False  # of what is measured, with the holes that `--fill` closes; else all is delivered
 
     @property
     def hectares(self) -> float:

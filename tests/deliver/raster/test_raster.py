@@ -475,3 +475,13 @@ def test_holes_are_filled_up_to_a_width(workspace: Workspace) -> None:
     assert shares[None][1] <= 0.1 + 1e-6
     assert shares[None][0] + shares[None][1] == pytest.approx(1.0, abs=0.01)
     assert shares[0.0][2] <= shares[None][2] <= shares["all"][2]
+
+
+def test_rasters_end_where_their_own_cells_are_measured(workspace: Workspace) -> None:
+    """Cells that fewer views than asked for show lie in the area of the other products, and are not painted."""
+    options = {"crs": UTM, "gsd": GSD, "terrain": False, "hillshade": False, "min_views": 6}
+    values = run_stage(workspace, BY_NAME["export-raster"], options).manifest.values
+    assert values["delivered_ha"] < 0.9 * values["area_ha"]
+    # A tenth of the outline's cells, whose border is drawn to a quarter of a cell.
+    assert values["interpolated"] < 0.11
+    assert values["measured"] > 0.89
