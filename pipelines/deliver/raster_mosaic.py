@@ -32,7 +32,7 @@ from pipelines.formats.geotiff import (
 )
 from pipelines.formats.vector_files import Json, feature
 from pipelines.surface.filling import fill_cells
-from pipelines.survey.measured_ground import MeasuredGround
+from pipelines.survey.measured_ground import MOST_FILLED, MeasuredGround
 from pipelines.survey.options import FillWidth
 from pipelines.survey.target_crs import TargetCrs
 
@@ -42,6 +42,7 @@ _SAMPLES_PX = 192  # a side of a window
 _OVERVIEW_PX = 4000  # along the longer side, at which islands are looked for
 _LEAST_ISLAND = 0.01  # of the largest part of the surface
 _COARSE_PX = 1500  # along the longer side, at which wide holes are filled
+_WIDER = 16.0  # holes than those that the area has by itself, as far as the rasters' tenth reaches
 _OUTLINES_PX = 2000  # along the longer side, at which interpolated parts are outlined
 
 _COLOURS = (
@@ -64,10 +65,10 @@ class _Window:
 class Mosaic:
     """Rasters over one frame, and the area (a polygon in their CRS) outside which they are empty.
 
-    They are whole inside it with `fill` "all". Else they end where their own measured cells do, which know more
-    than the area: holes up to a width of `fill` metres are filled, or, if it is None, those that
-    `MeasuredGround.outline` fills where pixels of the photographs are `photo_m` wide. Parts in the folder are kept:
-    `parts` of what is measured, `whole` of the rasters to deliver.
+    They are whole inside it with `fill` "all". Else they end where their own measured cells do, which are finer
+    than those that the area was found by: holes up to a width of `fill` metres are filled, or, if it is None, the
+    narrowest holes up to a tenth of the rasters. Pixels of the photographs are `photo_m` wide on the ground. Parts
+    in the folder are kept: `parts` of what is measured, `whole` of the rasters to deliver.
     """
 
     def __init__(
@@ -189,7 +190,10 @@ class Mosaic:
             )
 
         ground = MeasuredGround(seen[::-1], np.zeros(2), np.array([cell_m, self._photo_m]))
-        outline = ground.outline(shapely.transform(self.polygon, plan_in_m), fill)
+        within = shapely.transform(self.polygon, plan_in_m)
+        if fill is None and ground.share(within) >= 1.0 - MOST_FILLED:
+            return self.polygon
+        outline = ground.outline(within, fill, wider=_WIDER)
         return self.polygon if outline is None else shapely.transform(outline, plan_of_m)
 
     def _drop_islands(self) -> None:

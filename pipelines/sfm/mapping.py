@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 MapperName = Literal["incremental", "global"]
 
 # Up to here the incremental mapper takes minutes; its time grows faster than the number of photographs.
-_INCREMENTAL_UP_TO = 500
+_INCREMENTAL_UP_TO = 150
 _FEWEST_IMAGES = 3
 # Tracks that position each photograph in the global mapper, the longest ones. Of 400 photographs, all 98 000 tracks
 # took 2.3 times as long as 9700, for the same model. The mapper's own triangulation and adjustment of the others

@@ -18,7 +18,7 @@ from pipelines.core.types import BoolArray, FloatArray
 _SPIKE_M, _SPIKE_CELLS = 1.0, 3.0  # width of tongues that are cut off: the larger counts
 _LEAST_ISLAND = 0.01  # of the largest part: smaller ones are agreements by chance
 # Width of the holes that are filled unless the user says otherwise, and their largest share of the outline.
-_FILLED_M, _FILLED_PX, _MOST_FILLED = 2.0, 10, 0.1
+_FILLED_M, _FILLED_PX, MOST_FILLED = 2.0, 10, 0.1
 
 
 @dataclass(frozen=True)
@@ -42,24 +42,24 @@ class MeasuredGround(ArrayProduct):
     def save(self, path: Path) -> None:
         save_npz(path, vars(self))
 
-    def outline(self, within: Any, fill: float | None) -> Any | None:
+    def outline(self, within: Any, fill: float | None, *, wider: float = 1.0) -> Any | None:
         """Return the polygon of what is measured within another: holes up to a width filled, no spikes, no islands.
 
-        `fill` is the width in metres. None: two metres and ten pixels, halved until no more than a tenth of the
-        outline is filled. The result is None where nothing is measured.
+        `fill` is the width in metres. None: two metres and ten pixels, times `wider`, halved until no more than a
+        tenth of the outline is filled. The result is None where nothing is measured.
         """
         inside = self._inside(within)
         measured = _without_islands(self.measured & inside)
         if not measured.any():
             return None
-        width_m = max(_FILLED_M, _FILLED_PX * self.size_m[1]) if fill is None else fill
+        width_m = wider * max(_FILLED_M, _FILLED_PX * self.size_m[1]) if fill is None else fill
         spike = max(_SPIKE_M / self.cell_m, _SPIKE_CELLS) / 2
         while True:
             found = _without_islands(
                 _without_spikes(_closed(measured, (width_m / self.cell_m + 1) / 2), spike) & inside
             )
             filled = (found & ~measured).sum() / max(found.sum(), 1)
-            if fill is not None or filled <= _MOST_FILLED or width_m < self.cell_m:
+            if fill is not None or filled <= MOST_FILLED or width_m < self.cell_m:
                 break
             width_m /= 2
         if not found.any():  # narrower than a spike: all that there is
