@@ -11,7 +11,7 @@ reads position, yaw, pitch, roll and σ back, so that a table can be the input o
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from pipelines.core.files import replace_text
 from pipelines.core.products import dump_json
 from pipelines.core.types import FloatArray
 from pipelines.formats.tables import table_text
-from pipelines.geometry.cameras import RATIONAL_MODELS, Camera, distort, named_parameters, parameters_in, undistort
+from pipelines.geometry.cameras import Camera, distort, named_parameters, parameters_in, undistort
 from pipelines.geometry.lens_fit import FISHEYE, ForeignLens, nearest_camera
 
 CAM_FROM_GL = np.diag([1.0, -1.0, -1.0])
@@ -63,44 +63,44 @@ def lens_of(camera: Camera) -> Lens:
     OPENCV_FISHEYE, a rational lens (FULL_OPENCV with k4, k5, k6) or any other by OPENCV with k3.
     """
     named, error = named_parameters(camera), 0.0
-    place = {"w": camera.width, "h": camera.height, "fl_x": named["fx"], "fl_y": named["fy"]}
-    place |= {name: named[name] for name in ("cx", "cy")}
+    size: dict[str, float | int] = {"w": camera.width, "h": camera.height}
     if camera.model.endswith("FISHEYE"):
-        same = parameters_in(camera, FISHEYE)
-        if same is None:
-            start = Camera(FISHEYE, camera.width, camera.height, np.array([*place.values()][2:] + [0.0] * 4))
-            fitted, error = nearest_camera(ForeignLens(start, partial(distort, camera)))
-            same = fitted.params
-        names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4")
-        return Lens(FISHEYE, {**place, **dict(zip(names, same.tolist(), strict=True))}, error)
-    terms = ("k1", "k2", "k3", "p1", "p2")
-    if camera.model in RATIONAL_MODELS and not any(named.get(name) for name in ("k4", "k5", "k6")):
-        return Lens("OPENCV", {**place, **{name: named.get(name, 0.0) for name in terms}}, 0.0)
-    fitted, error = _polynomial(camera, named)
-    return Lens("OPENCV", {**place, **dict(zip(("fl_x", "fl_y", *terms), fitted, strict=True))}, error)
+        model, terms = FISHEYE, ["k1", "k2", "k3", "k4"]
+        values = parameters_in(camera, FISHEYE)
+        if values is None:
+            start = np.array([*(named[name] for name in ("fx", "fy", "cx", "cy")), 0.0, 0.0, 0.0, 0.0])
+            nearest = ForeignLens(replace(camera, model=FISHEYE, params=start), partial(distort, camera))
+            fitted, error = nearest_camera(nearest)
+            values = fitted.params
+    else:
+        model, terms = "OPENCV", ["k1", "k2", "p1", "p2", "k3"]
+        full = parameters_in(camera, "FULL_OPENCV")
+        if full is None or full[9:].any():
+            values, error = _polynomial(camera, named)
+        else:
+            values = full[:9]
+    names = ("fl_x", "fl_y", "cx", "cy", *terms)
+    return Lens(model, {**size, **dict(zip(names, values.tolist(), strict=True))}, error)
 
 
-def _polynomial(camera: Camera, named: dict[str, float]) -> tuple[list[float], float]:
-    """Return fx, fy, k1, k2, k3, p1, p2 of the polynomial nearest to a lens, and its largest error in pixels."""
+def _polynomial(camera: Camera, named: dict[str, float]) -> tuple[FloatArray, float]:
+    """Return fx, fy, cx, cy, k1, k2, p1, p2, k3 of the polynomial nearest to a lens, and its error in pixels."""
     x, y = (np.linspace(0.0, side, _LENS_SAMPLES) for side in (camera.width, camera.height))
     ray = undistort(camera, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     ray = ray[np.isfinite(ray).all(axis=1)]
     x, y = ray.T
     r2, none = x * x + y * y, np.zeros(len(ray))
-    powers = np.stack([r2, r2**2, r2**3], axis=-1)
-    # Linear in fx, fy, and the other terms times their mean.
-    by_x = np.column_stack([x, none, x[:, None] * powers, 2 * x * y, r2 + 2 * x * x])
-    by_y = np.column_stack([none, y, y[:, None] * powers, r2 + 2 * y * y, 2 * x * y])
-    design = np.concatenate([by_x * named["fx"], by_y * named["fy"]])
+    # Linear in fx, fy, and each other term times the focal length, which differs little between the axes.
+    by_x = np.column_stack([x, none, x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3])
+    by_y = np.column_stack([none, y, y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3])
+    focal = np.repeat([named["fx"], named["fy"]], len(ray))[:, None]
     target = (distort(camera, ray) - [named["cx"], named["cy"]]).T.ravel()
-    gain_x, gain_y, *terms = np.linalg.lstsq(design, target, rcond=None)[0].tolist()
-    # The terms are multiplied by the fitted focal lengths where the file is read.
-    gain = (gain_x + gain_y) / 2
-    fitted = [gain_x * named["fx"], gain_y * named["fy"], *(term / gain for term in terms)]
-    solution = np.array([gain_x, gain_y, *(term / gain for term in terms)])
-    scale = np.repeat([gain_x, gain_y], len(ray))
-    error = design[:, :2] @ solution[:2] + scale * (design[:, 2:] @ solution[2:]) - target
-    return fitted, float(np.hypot(*error.reshape(2, -1)).max())
+    solution = np.linalg.lstsq(focal * np.concatenate([by_x, by_y]), target, rcond=None)[0]
+    gain, terms = solution[:2], solution[2:] / solution[:2].mean()
+    model = np.repeat(gain, len(ray)) * (np.concatenate([x, y]) + np.concatenate([by_x, by_y])[:, 2:] @ terms)
+    error = (focal[:, 0] * model - target).reshape(2, -1)
+    lens = [*gain * [named["fx"], named["fy"]], named["cx"], named["cy"], *terms]
+    return np.array(lens), float(np.hypot(*error).max())
 
 
 def write_transforms(path: Path, frames: Sequence[Frame], lenses: Sequence[Lens], points: str) -> None:
