@@ -29,8 +29,8 @@ class CleanOptions(CropOptions):
     gaussians: int | None = Field(
         None,
         ge=1,
-        description="Largest number of Gaussians: those go that show least in the training views. Without it: "
-        "all stay.",
+        description="Largest number of Gaussians: those that show least in training views are merged into their "
+        "neighbours. Without it: all stay.",
     )
     appearance_passes: int = Field(
         5,

@@ -4,7 +4,8 @@
 2. Of the others, floaters go: those whose place (`surface.floaters`) and whose looks say so. A place alone does
    not: stereo misses wires, and the sky is far from everything. The looks are an opacity below a tenth, or
    photographs whose error grows with the opacity.
-3. With --gaussians, those go that show least in the training views. With --sh-degree, harmonics are cut off.
+3. With --gaussians, those that show least in the training views are merged into their neighbours
+   (`splat.consolidation`). With --sh-degree, harmonics are cut off.
 4. After step 3, colours and opacities are fitted to the renders of the trained model. No centre moves.
 
 Reads `ingest/survey.json`, the photographs, `sfm/sparse`, `sim3/`, `train/model.json` and `train/gaussians.ply`.
@@ -29,10 +30,11 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import Product, Remark, load_json, save_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import CLEANED, CLEANING, MODEL, REMOVED
-from pipelines.core.types import BoolArray, ByteArray, Float32Array
+from pipelines.core.types import BoolArray, ByteArray
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.geometry.cameras import ViewPose, pose_matrix
 from pipelines.splat.appearance import ShownView, refine_appearance, shuffled_passes
+from pipelines.splat.consolidation import consolidated, most_shown
 from pipelines.splat.gaussians import Gaussians, write_gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
@@ -107,11 +109,12 @@ def run(stage: StageRun, options: CleanOptions) -> Summary:
     before = mean_psnr(renderer, compared, progress)
     clean = _showing(renderer, trained.gaussians.select(torch.from_numpy(reason == KEPT)), backend)
     without = mean_psnr(clean, compared, progress)
+    fewer = clean.trained.gaussians
     if evidence is not None and options.gaussians is not None:
-        reason[_least_shown(evidence.weight_px, reason == KEPT, options.gaussians)] = CONSOLIDATED
-    smaller = _smaller(
-        clean, trained.gaussians.select(torch.from_numpy(reason == KEPT)), backend, options, progress
-    )
+        rows, shown = np.flatnonzero(reason == KEPT), evidence.weight_px[reason == KEPT]
+        reason[rows[~most_shown(shown, options.gaussians)]] = CONSOLIDATED
+        fewer = consolidated(fewer, shown, options.gaussians)
+    smaller = _smaller(clean, fewer, backend, options, progress)
     made = smaller.trained.gaussians
     after = without if smaller is clean else mean_psnr(smaller, compared, progress)
     filtered = trained.model.mip_filter
@@ -209,14 +212,6 @@ def _measured(workspace: Workspace, progress: Progress) -> Iterator[MeasuredView
         center = scene.poses.cam_center_in_model[index]
         pose = ViewPose(maps.camera(index), scene.poses.cam_from_model[index], center)
         yield MeasuredView(pose, maps.depth(index))
-
-
-def _least_shown(weight_px: Float32Array, kept: BoolArray, most: int) -> BoolArray:
-    """Return which of the kept Gaussians (N,) show least in the training views, so that `most` are left."""
-    least = np.zeros(len(kept), dtype=bool)
-    rows = np.flatnonzero(kept)
-    least[rows[np.argsort(weight_px[rows], kind="stable")[: max(len(rows) - most, 0)]]] = True
-    return least
 
 
 def _showing(renderer: ModelRenderer, gaussians: Gaussians, backend: Rasterizer) -> ModelRenderer:
