@@ -20,7 +20,7 @@ import click
 from georef_cli import boundary
 from georef_cli.command import Command, merged_verbosity, shared_options
 from georef_cli.native_lines import native_lines_logged
-from pipelines.core.stages import CHANGE, DELIVERABLES, PIPELINE, SPLAT, StageSpec
+from pipelines.core.stages import CHANGE, CLEAN, DELIVERABLES, PIPELINE, SPLAT, StageSpec
 from pipelines.core.version import described_version
 
 PROGRAM = "georef"
@@ -72,7 +72,7 @@ COMMANDS: dict[str, HelpLine] = {
     "info": HelpLine("Pipeline", "Show where on Earth the result is, and what each file is for."),
     "view": HelpLine("Pipeline", "See the trained model in a browser, and measure in it."),
     "marks": HelpLine("Pipeline", "Propose marks of ground points in the photographs that lack them."),
-    **_of_stages(*PIPELINE, *DELIVERABLES, CHANGE),
+    **_of_stages(*PIPELINE, CLEAN, *DELIVERABLES, CHANGE),
     "help": HelpLine("Start", "Explain a topic, such as heights or options, or a command."),
     "doctor": HelpLine("Start", "Show what this machine offers: memory, GPU, backends, geoid grids."),
 }

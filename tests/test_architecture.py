@@ -35,6 +35,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("pipelines.jobs",),
     (
         "pipelines.change",
+        "pipelines.clean",
         "pipelines.compare",
         "pipelines.deliver",
         "pipelines.evaluate",

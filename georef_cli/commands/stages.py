@@ -54,6 +54,19 @@ _HELP = {
       georef train flight --iterations 4000
       georef train flight --iterations 5000 --max-image-size 800 --backend cpu
     """,
+    "clean": """
+    Gaussians go that are too transparent, float before the surface or far from everything, or lie outside a crop.
+    --gaussians keeps those that show most, merges the others into them, and fits colours to the renders of the
+    trained model. The PSNR of the test views is stated before and after. The files of the splat (PLY, SPZ, tiles)
+    then take the cleaned model, as long as it was made from the trained one as it is; rasters, cloud and mesh keep
+    the trained one.
+
+    \b
+    Examples:
+      georef clean flight
+      georef clean flight --gaussians 1500000
+      georef clean flight --crop --sh-degree 1 --gaussians 500000
+    """,
     "export-raster": """
     Cloud Optimized GeoTIFF in a CRS. The orthophoto is a true one, of the photographs themselves: walls do not
     lean. Cells that were not measured have no value, but for narrow holes. FILE.georef.json beside each raster

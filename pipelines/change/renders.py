@@ -19,7 +19,6 @@ from pipelines.formats.geotiff import sampled_raster
 from pipelines.geodesy.enu import Origin, ecef_from_enu_rotation, ecef_from_lla, enu_from_ecef, lla_of
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.geometry.similarity import Similarity
-from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.scene import photographs
@@ -64,8 +63,7 @@ def render_pair(
         if not (workspace.has(MODEL) and workspace.has(GAUSSIANS)):
             return f"{workspace.root.name} has no trained model."
     before = load_trained(workspaces[0])
-    backend = rasterizer("auto", progress)
-    renderer = _renderer(before, workspaces[0], backend)
+    renderer = _renderer(before, workspaces[0], progress)
     poses = [renderer.pose(index) for index in before.indices("train")]
     best = nearest_to_middle(poses, _in_model(before, grid, plan))
     if best is None:
@@ -73,7 +71,7 @@ def render_pair(
     pose = ViewPose(_small(poses[best].pinhole), poses[best].cam_from_model, poses[best].center_in_model)
     first = _pixels(renderer, pose)
     after = load_trained(workspaces[1])
-    second = _pixels(_renderer(after, workspaces[1], backend), moved_pose(pose, later_from_earlier(before, after)))
+    second = _pixels(_renderer(after, workspaces[1], progress), moved_pose(pose, later_from_earlier(before, after)))
     return RenderPair(before.model.cameras[before.indices("train")[best]].name, first, second)
 
 
@@ -102,8 +100,9 @@ def _in_model(before: TrainedSurvey, grid: CommonGrid, plan: tuple[float, float]
     return np.asarray(before.geo_from_model.inverse().apply(in_geo)[0])
 
 
-def _renderer(trained: TrainedSurvey, workspace: Workspace, backend: Rasterizer) -> ModelRenderer:
+def _renderer(trained: TrainedSurvey, workspace: Workspace, progress: Progress) -> ModelRenderer:
     images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
+    backend = rasterizer("auto", progress, mip_filter=trained.model.mip_filter)
     return ModelRenderer(trained, images, backend)
 
 

@@ -2,6 +2,8 @@
 
 # By workspace path; a path without a suffix is a folder. In the order in which people look for them.
 DESCRIPTIONS: dict[str, str] = {
+    "clean/gaussians.ply": "the cleaned model, which files of the splat take; in the frame of the training",
+    "clean/removed.ply": "the floaters that were removed, to look at; in the same frame",
     "export/splat.ply": "the splat as trained, to look at and to edit (SuperSplat, Blender)",
     "measurable/splat.measurable.ply": "the splat to measure in, for viewers that pick centres; many times larger",
     "raster/orthophoto.tif": "orthophoto, for GIS and CAD",

@@ -31,6 +31,8 @@ REPORT = "evaluate/report.json"
 RENDERS = "evaluate/renders"
 REFERENCE_MAP, REFERENCE_HISTOGRAM = "evaluate/reference_map.png", "evaluate/reference_histogram.png"
 ACCURACY_MAP = "evaluate/accuracy.png"  # only where the measurements determine the scene
+CLEANED, CLEANING = "clean/gaussians.ply", "clean/clean.json"
+REMOVED = "clean/removed.ply"  # only if floaters were removed
 SPLAT = "export/splat.ply"
 ORTHOPHOTO_PREVIEW = "raster/preview.png"
 HILLSHADE = "raster/hillshade.png"
@@ -108,6 +110,9 @@ SOLVED = (
 
 # The area of interest, to which splats are cropped on request.
 CROPPED_BY = whole_products(SPARSE, SIM3, optional=True)
+
+# The Gaussians that `georef clean` has left, which files of the splat take in place of the trained ones.
+TAKEN = whole_products(CLEANED, optional=True)
 
 # The accuracy of the result, which every file to hand over states.
 HEADLINE = ProductPart(REPORT, fields=("headline",), optional=True)
@@ -241,10 +246,21 @@ PIPELINE: tuple[StageSpec, ...] = (
         name="export-ply",
         module="pipelines.deliver.ply",
         options_place="pipelines.deliver.options:ExportPlyOptions",
-        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *CROPPED_BY, APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *TAKEN, *CROPPED_BY, APPLIED_RIG, HEADLINE),
         product=SPLAT,
         title="Write the splat as a PLY with its place on Earth.",
     ),
+)
+
+# Makes another model from the trained one, on request.
+CLEAN = StageSpec(
+    name="clean",
+    module="pipelines.clean.stage",
+    options_place="pipelines.clean.options:CleanOptions",
+    reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT, MODEL, GAUSSIANS), APPLIED_RIG),
+    product=CLEANED,
+    title="Remove floaters from the trained model, and make it smaller.",
+    also=(CLEANING,),
 )
 
 # What a survey hands over besides the PLY: each is made on request, and none is read by another stage.
@@ -295,7 +311,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-spz",
         module="pipelines.deliver.spz",
         options_place="pipelines.deliver.options:ExportSpzOptions",
-        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *CROPPED_BY, APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *TAKEN, *CROPPED_BY, APPLIED_RIG, HEADLINE),
         product=SPZ,
         title="Write the splat as SPZ, for viewers on the web.",
     ),
@@ -303,7 +319,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-tiles",
         module="pipelines.deliver.tiles",
         options_place="pipelines.deliver.options:ExportTilesOptions",
-        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *CROPPED_BY, APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *TAKEN, *CROPPED_BY, APPLIED_RIG, HEADLINE),
         product=TILES,
         title="Write the splat as 3D Tiles, for web globes.",
         also=(TILES_GLB,),
@@ -425,8 +441,8 @@ TRAIN_SEAMS = StageSpec(
 )
 BLOCK_PARTS = (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD, TRAIN_BLOCK, TRAIN_SEAMS)
 
-STAGES = (*PIPELINE, *DELIVERABLES, CHANGE, ADJUST, *BLOCK_PARTS)
-BY_NAME = {spec.name: spec for spec in (*PIPELINE, *DELIVERABLES, CHANGE)}
+STAGES = (*PIPELINE, CLEAN, *DELIVERABLES, CHANGE, ADJUST, *BLOCK_PARTS)
+BY_NAME = {spec.name: spec for spec in (*PIPELINE, CLEAN, *DELIVERABLES, CHANGE)}
 
 
 def producer_of(path: str) -> StageSpec:

@@ -22,6 +22,7 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import (
     BY_NAME,
     CHANGE,
+    CLEAN,
     DELIVERABLES,
     PIPELINE,
     StageSpec,
@@ -222,7 +223,7 @@ def status(workspace: Workspace, memo: Memo | None = None, before: StageSpec | N
     requests, writer = read_requests(workspace.root), WriteLock(workspace.root).activity()
     begun = [
         spec
-        for spec in ((*DELIVERABLES, CHANGE) if before is None else ())
+        for spec in ((CLEAN, *DELIVERABLES, CHANGE) if before is None else ())
         if (workspace.root / spec.folder).exists() or workspace.partial(spec).exists()
     ]
     rows: list[StageState] = []

@@ -33,7 +33,7 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import MeasurableOptions
 from pipelines.deliver.placement import place
 from pipelines.deliver.ply import write_ply
-from pipelines.deliver.splat import crop_of, placed_splat, splat_values
+from pipelines.deliver.splat import placed_splat, splat_values
 from pipelines.geometry.cameras import pose_matrix
 from pipelines.geometry.similarity import Similarity
 from pipelines.jobs.costs import iteration_seconds
@@ -46,6 +46,7 @@ from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.sh import coefficient_count
 from pipelines.splat.surface import surface_discs
+from pipelines.surface.crop import crop_of
 from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_settings, pixel_on_surface_m
 from pipelines.surface.surface_views import ModelRenderer, SurfaceView, SurfaceViews
 from pipelines.survey.headline import headline_of
@@ -74,7 +75,7 @@ def run(stage: StageRun, options: MeasurableOptions) -> Summary:
     trained, progress = load_trained(stage.workspace), stage.progress
     geo_from_model = trained.geo_from_model
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
-    backend = rasterizer("auto", progress)
+    backend = rasterizer("auto", progress, mip_filter=trained.model.mip_filter)
     renderer = ModelRenderer(trained, images, backend)
     log.info("export-ply --measurable: %s", _estimate(renderer, options) or "time and size cannot be estimated")
     images.build(progress)
@@ -101,6 +102,7 @@ def run(stage: StageRun, options: MeasurableOptions) -> Summary:
     means, accuracy = trained.gaussians.means.numpy(), headline_of(stage.workspace)
     placement = place(trained.model, trained.survey, means, accuracy)
     splat = placed_splat(refined, placement, options, crop_of(stage.workspace, options))
+    splat = replace(splat, mip_filter=trained.model.mip_filter)
     write_ply(splat, stage.out / Path(MEASURABLE_SPLAT).name, options)
     psnr_text = "" if change is None else f", PSNR {change:+.2f} dB"
     return Summary(

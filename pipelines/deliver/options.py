@@ -6,7 +6,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, Field
 
 from pipelines.core.options import ExtraMarker
-from pipelines.survey.options import CrsOptions, FilledAreaOptions
+from pipelines.survey.options import CropOptions, CrsOptions, FilledAreaOptions
 
 # The page was tried with this version: the extensions of splats in glTF are younger than those of meshes.
 CESIUM = "https://cesium.com/downloads/cesiumjs/releases/1.145/Build/Cesium/"
@@ -15,17 +15,17 @@ CESIUM = "https://cesium.com/downloads/cesiumjs/releases/1.145/Build/Cesium/"
 Compression = Literal["spz", "none"]
 
 
-class SplatOptions(FilledAreaOptions):
-    """Options of every file that holds the Gaussians."""
+class SplatOptions(CropOptions):
+    """Options of every file that holds the Gaussians of the model, cleaned or as trained."""
 
-    crop: bool = Field(
-        False, description="Leave out Gaussians outside the area of interest. --boundary implies it."
+    trained: bool = Field(
+        False,
+        description="Take the trained model, even if `georef clean` has made another of it, which the files of the "
+        "splat take otherwise.",
     )
-    keep_sky: bool = Field(False, description="With a crop: keep what lies higher than all cameras.")
-    min_opacity: float = Field(0.005, ge=0, lt=1, description="Leave out Gaussians that are less opaque.")
 
 
-class PlyOptions(SplatOptions):
+class PlyOptions(CropOptions):
     """Options of every PLY of the splat."""
 
     up: Literal["z", "y", "-y"] = Field(
@@ -35,7 +35,7 @@ class PlyOptions(SplatOptions):
     )
 
 
-class ExportPlyOptions(PlyOptions):
+class ExportPlyOptions(PlyOptions, SplatOptions):
     """Options of the export of the splat as a 3DGS PLY with its sidecar."""
 
 
@@ -198,6 +198,13 @@ class ExportTilesOptions(WebSplatOptions, PageOptions):
 
     max_tile_gaussians: int = Field(
         200_000, ge=1000, le=3_000_000, description="Largest number of Gaussians in a tile."
+    )
+    budget: int = Field(
+        8_000_000,
+        ge=1000,
+        description="Largest number of Gaussians in all levels of the tileset together; the finest tiles are left "
+        "out where they would exceed it. CesiumJS keeps the tiles that it has loaded, with some 500 bytes a "
+        "Gaussian: the default is 4 GB.",
     )
     compression: Compression = Field(
         "spz",

@@ -36,5 +36,5 @@ def write_ply(splat: PlacedSplat, path: Path, options: PlyOptions) -> None:
     axes, gaussians = _ENU_FROM_AXES.get(options.up), splat.gaussians
     if axes is not None:
         gaussians = transformed(gaussians, Similarity(1.0, axes.T))
-    write_gaussians(path, gaussians)
+    write_gaussians(path, gaussians, mip_filter=splat.mip_filter)
     write_sidecar(splat.placement.sidecar(axes), path)

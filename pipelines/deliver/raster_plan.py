@@ -143,7 +143,9 @@ def plan_splats(
         np.column_stack([column, row, level - xyz[:, 2]]),
         cov,
         torch.sigmoid(gaussians.logit_opacities.double()).numpy()
-        * _edge_on(cov * np.outer(metric, metric), dilation_cells2(training_px)),
+        * _faintness(
+            cov * np.outer(metric, metric), dilation_cells2(training_px), mip_filter=trained.model.mip_filter
+        ),
         _colours_from_above(gaussians, trained),
     )
     return splats, level
@@ -166,11 +168,12 @@ def _derivative(points: FloatArray, target: TargetCrs, frame: RasterFrame) -> Re
     return RegularGridInterpolator(tuple(axes), by_geo.reshape(*3 * (_NODES,), 9))
 
 
-def _edge_on(cov: FloatArray, dilation: float) -> FloatArray:
+def _faintness(cov: FloatArray, dilation: float, *, mip_filter: bool) -> FloatArray:
     """Return factors (N,) of the opacity that take from discs seen edge-on the area that dilation gives them.
 
     A wall is a stack of discs. Each would be widened to a pixel without getting fainter, and a hundred of them
-    would paint the wall pixels wide beside its roof. A disc seen face-on keeps the opacity of the training.
+    would paint the wall pixels wide beside its roof. A disc seen face-on keeps the opacity of the training. With
+    the mip filter, the factors take from all discs what dilation gives them, as they did in the training.
 
     Args:
         cov: (N, 3, 3) of columns, rows and depth, all in cells.
@@ -181,6 +184,8 @@ def _edge_on(cov: FloatArray, dilation: float) -> FloatArray:
     face = np.prod(squared / (squared + dilation), axis=1)
     dilated = (seen[:, 0, 0] + dilation) * (seen[:, 1, 1] + dilation) - seen[:, 0, 1] ** 2
     area = np.maximum(np.linalg.det(seen), 0.0) / dilated
+    if mip_filter:
+        return np.asarray(np.sqrt(area))
     return np.asarray(np.sqrt(np.clip(area / np.maximum(face, 1e-300), 0.0, 1.0)))
 
 

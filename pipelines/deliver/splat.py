@@ -1,9 +1,15 @@
-"""The splat to deliver: the opaque Gaussians of the trained model, in the frame of the placement."""
+"""The splat to deliver: the opaque Gaussians of the model, in the frame of the placement.
+
+The model is the trained one, or what `georef clean` has made of it. Its place on Earth is that of the trained model
+in any case, so that a cleaned file lies exactly where the other did.
+"""
 
 import itertools
+import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,58 +17,57 @@ from scipy.special import expit
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.products import load_json
-from pipelines.core.stages import BLOCK_RECORD, GAUSSIANS, MODEL
+from pipelines.core.stages import BLOCK_RECORD, CLEAN, CLEANED, GAUSSIANS, MODEL
+from pipelines.core.staleness import is_made_from
 from pipelines.core.types import BoolArray, Float32Array, FloatArray, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import SplatOptions, WebSplatOptions
 from pipelines.deliver.placement import Placement, place
 from pipelines.formats.splat_ply import SplatArrays, read_centres, read_logit_opacities
-from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.sh import coefficient_count
-from pipelines.surface.measured_area import area_of
-from pipelines.survey.area import Area
+from pipelines.surface.crop import Crop, crop_of
 from pipelines.survey.block_plan import BlockRecord
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.options import CropOptions
 from pipelines.survey.trained_model import TrainedModel
-from pipelines.survey.trained_survey import load_cameras
+
+log = logging.getLogger(__name__)
+
+Origin = Literal["trained", "cleaned"]
 
 
-@dataclass(frozen=True)
-class Crop:
-    """Area outside which Gaussians are left out; those higher than `sky_m` in `geo` stay."""
+def model_to_deliver(workspace: Workspace, options: SplatOptions) -> tuple[Path, Origin]:
+    """Return the file of the Gaussians to deliver, in `model`, and of which model it is; errors as of `path`.
 
-    area: Area
-    geo_from_model: Similarity
-    sky_m: float
-
-    def keeps(self, center_in_model: FloatArray | Float32Array) -> BoolArray:
-        """Return which of Gaussians' centres (N, 3) stay."""
-        center = self.geo_from_model.apply(center_in_model)
-        return self.area.contains(center) | (center[:, 2] > self.sky_m)
-
-
-def crop_of(workspace: Workspace, options: SplatOptions) -> Crop | None:
-    """Return the crop that the options ask for; None: none. Errors as of `load_cameras` and `area_of`.
-
-    The sky is what lies higher than all cameras.
+    It is that of `georef clean`, if it was made from the trained model as it is, and --trained is not given.
     """
-    if not options.crop and options.boundary is None:
-        return None
-    solved = load_cameras(workspace)
-    cameras = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
-    sky_m = float(cameras[:, 2].max()) if options.keep_sky else np.inf
-    return Crop(area_of(options, solved, workspace), solved.geo_from_model, sky_m)
+    trained = workspace.path(GAUSSIANS)
+    if options.trained or not workspace.has(CLEANED):
+        return trained, "trained"
+    if is_made_from(workspace, CLEAN, (MODEL, GAUSSIANS), {}):
+        return workspace.path(CLEANED), "cleaned"
+    log.warning(
+        "%s was made from another training and is not used: the file holds the trained model. Run `%s` again, or "
+        "give --trained.",
+        CLEANED, workspace.command_of(CLEAN), extra={"code": "cleaned-model-stale"},
+    )  # fmt: skip
+    return trained, "trained"
 
 
 @dataclass(frozen=True)
 class PlacedSplat:
-    """Splat in the frame `file` of its placement, and the number of Gaussians that were left out."""
+    """Splat in the frame `file` of its placement, the number of Gaussians that were left out, and their model.
+
+    `mip_filter`: the training had it, and renders of the splat need it.
+    """
 
     gaussians: Gaussians
     placement: Placement
     left_out: int
+    model: Origin = "trained"
+    mip_filter: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,8 +87,9 @@ class SplatParts:
     center_in_file: Float32Array
     left_out: int
     sh_degree: int
-    options: SplatOptions
+    options: CropOptions
     crop: Crop | None
+    model: Origin = "trained"
 
     def __iter__(self) -> Iterator[SplatArrays]:
         """Yield the Gaussians of each part that are delivered, if it has any."""
@@ -101,6 +107,7 @@ def splat_values(splat: PlacedSplat | SplatParts) -> dict[str, object]:
     count = len(splat.gaussians if isinstance(splat, PlacedSplat) else splat.center_in_file)
     accuracy, sigma = placement.accuracy, placement.georeference_sigma
     return {
+        "model": splat.model,
         "gaussians": count,
         "left_out": splat.left_out,
         "origin_lla": None if placement.origin_lla is None else vector3(placement.origin_lla),
@@ -112,25 +119,29 @@ def splat_values(splat: PlacedSplat | SplatParts) -> dict[str, object]:
 
 def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
     """Return the splat of a workspace, placed on Earth; a DegenerateGeometryError: no Gaussian is opaque enough."""
+    path, origin = model_to_deliver(workspace, options)
+    splat = placed_splat(read_gaussians(path), _trained_placement(workspace), options, crop_of(workspace, options))
+    return replace(splat, model=origin, mip_filter=load_json(TrainedModel, workspace.path(MODEL)).mip_filter)
+
+
+def _trained_placement(workspace: Workspace) -> Placement:
     survey, model = load_survey(workspace), load_json(TrainedModel, workspace.path(MODEL))
-    gaussians = read_gaussians(workspace.path(GAUSSIANS))
-    placement = place(model, survey, gaussians.means.numpy(), headline_of(workspace))
-    return placed_splat(gaussians, placement, options, crop_of(workspace, options))
+    return place(model, survey, read_centres(workspace.path(GAUSSIANS)), headline_of(workspace))
 
 
 def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatParts:
     """Return the splat of a workspace, placed on Earth, to be read part by part; a GeorefError: as `load_splat`."""
-    survey, model = load_survey(workspace), load_json(TrainedModel, workspace.path(MODEL))
-    path = workspace.path(GAUSSIANS)
+    path, origin = model_to_deliver(workspace, options)
     centers, crop = read_centres(path), crop_of(workspace, options)
     chosen = _chosen(centers, read_logit_opacities(path), options, crop)
     _require_any(chosen, options)
-    placement = place(model, survey, centers, headline_of(workspace))
+    placement = _trained_placement(workspace)
     center_in_file = placement.file_from_model.apply(centers[chosen]).astype(np.float32)
-    rows = _rows_of_blocks(workspace, len(centers))
+    whole = (slice(0, len(centers)),)
+    rows = whole if origin == "cleaned" else _rows_of_blocks(workspace, len(centers))
     trained = read_gaussians(path, slice(0, 1)).sh_degree
     degree = trained if options.sh_degree is None else min(options.sh_degree, trained)
-    return SplatParts(path, rows, placement, center_in_file, int((~chosen).sum()), degree, options, crop)
+    return SplatParts(path, rows, placement, center_in_file, int((~chosen).sum()), degree, options, crop, origin)
 
 
 def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
@@ -151,7 +162,7 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
 
 
 def placed_splat(
-    gaussians: Gaussians, placement: Placement, options: SplatOptions, crop: Crop | None = None
+    gaussians: Gaussians, placement: Placement, options: CropOptions, crop: Crop | None = None
 ) -> PlacedSplat:
     """Return the Gaussians to deliver, moved from `model` to the placement; a DegenerateGeometryError: none is."""
     chosen = _chosen(gaussians.means.numpy(), gaussians.logit_opacities.numpy(), options, crop)
@@ -163,14 +174,14 @@ def placed_splat(
 def _chosen(
     center_in_model: FloatArray | Float32Array,
     logit_opacities: Float32Array,
-    options: SplatOptions,
+    options: CropOptions,
     crop: Crop | None,
 ) -> BoolArray:
     opaque: BoolArray = expit(logit_opacities) >= options.min_opacity
     return opaque if crop is None else opaque & crop.keeps(center_in_model)
 
 
-def _require_any(chosen: BoolArray, options: SplatOptions) -> None:
+def _require_any(chosen: BoolArray, options: CropOptions) -> None:
     if not chosen.any():
         raise DegenerateGeometryError(
             "no-opaque-gaussians",

@@ -28,7 +28,7 @@ def run(stage: StageRun, options: ExportSpzOptions) -> Summary:
     path = stage.out / Path(SPZ).name
     version: SpzVersion = 3 if options.spz_version == "3" else 4
     try:
-        write_spz(path, codec_arrays(upright, options.sh_degree), version)
+        write_spz(path, codec_arrays(upright, options.sh_degree), version, mip_filter=splat.mip_filter)
     except InputError as error:
         message = f"{error}. `georef export-tiles` writes scenes of any size."
         raise InputError("spz-range", message) from error

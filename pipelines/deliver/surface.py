@@ -30,7 +30,9 @@ def surface_views(stage: StageRun, trained: TrainedSurvey, *, colours: bool = Fa
     """Return depth maps of the training views, in the stage's folder until closed; errors as of `SurfaceViews`."""
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(stage.progress)
-    renderer = ModelRenderer(trained, images, rasterizer("auto", stage.progress))
+    renderer = ModelRenderer(
+        trained, images, rasterizer("auto", stage.progress, mip_filter=trained.model.mip_filter)
+    )
     folder = stage.out / "depth_maps"
     return SurfaceViews(renderer, folder, colours=colours, confirmed=True, progress=stage.progress)
 

@@ -9,8 +9,9 @@ All files are in the frame of the placement, East-North-Up; the tileset's root p
 """
 
 import json
+import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,10 +34,12 @@ from pipelines.formats.gltf import SPLATS, SPZ_IN_GLTF, decode_plain_glb, encode
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.formats.spz import FRACTIONAL_BITS, decode_spz, encode_spz
 from pipelines.formats.tiles_archive import write_tiles_archive
-from pipelines.splat.level_of_detail import DetailTile, Tiler, best_cut, build_tiles, scene_box
+from pipelines.splat.level_of_detail import DetailTile, Tiler, best_cut, build_tiles, scene_box, within_budget
 from pipelines.splat.sh import coefficient_count
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.target_crs import target_crs, without_grid
+
+log = logging.getLogger(__name__)
 
 _REACH_M = 2.0 ** (23 - FRACTIONAL_BITS)  # largest coordinate that SPZ's 24 bits hold at their finest step
 # Bytes of a Gaussian in SPZ before its compression, or in plain arrays: without harmonics, and of each of these.
@@ -66,9 +69,11 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
     needed_bytes = copies * count * (each + harmonic * coefficient_count(splat.sh_degree))
     advice = "give a lower --sh-degree or a larger --min-opacity"
     require_space(stage.out, needed_bytes, f"tiles of {count} Gaussians", advice)
-    tiling = Tiling(scene_box(splat.center_in_file), count, options.max_tile_gaussians, options.compression)
-    root = write_tiles(stage.out, splat, tiling, sidecar, stage.progress)
-    in_glb = write_whole(stage.out, splat, root, sidecar, count, compression=options.compression)
+    box = scene_box(splat.center_in_file)
+    tiling = Tiling(box, count, options.max_tile_gaussians, options.compression)
+    whole = write_tiles(stage.out, splat, tiling, sidecar, stage.progress)
+    in_glb = write_whole(stage.out, splat, whole, sidecar, count, compression=options.compression)
+    root = _without_finest(stage.out, whole, sidecar, options)
     for name in (TILESET, GLB):
         write_sidecar(sidecar, stage.out / name)
     write_scene_page(page, stage.out)
@@ -76,21 +81,41 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
     if options.archive:
         names = [TILESET, *(_content_uri(tile.name) for tile in tiles)]
         write_tiles_archive(stage.out / ARCHIVE, stage.out, names)
+    levels = [_level(stage.out, level) for level in root.levels()]
+    for number, level in enumerate(levels):
+        log.info(
+            "level %d: %d tiles, %d Gaussians, %.1f MB",
+            number, level["tiles"], level["gaussians"], level["bytes"] / 1e6,
+        )  # fmt: skip
+    finest = sum(tile.count for tile in tiles if not tile.children)
     size = sum(path.stat().st_size for path in stage.out.rglob("*") if path.is_file())
     values = {
         **splat_values(splat),
         "tiles": len(tiles),
         "leaves": sum(not tile.children for tile in tiles),
         "coarsest": root.count,
+        "finest": finest,
+        "held": sum(level["gaussians"] for level in levels),
+        "levels": levels,
         "glb_gaussians": in_glb,
         "bytes": size,
     }
-    sentence = f"{GLB} holds {in_glb} merged Gaussians: viewers cannot load all {count} from one file"
-    merged = (Remark(code="glb-merged", sentence=sentence),)
+    warnings = []
+    if in_glb < count:
+        sentence = f"{GLB} holds {in_glb} merged Gaussians: viewers cannot load all {count} from one file"
+        warnings.append(Remark(code="glb-merged", sentence=sentence))
+    if finest < count:
+        sentence = (
+            f"The finest tiles show {finest} merged Gaussians instead of all {count}: with these, the levels of "
+            f"{TILESET} would exceed the --budget of {options.budget} that a viewer can hold. `georef clean "
+            "--gaussians` makes a smaller model with less loss; viewers with more memory take a larger --budget"
+        )
+        warnings.append(Remark(code="tiles-coarser", sentence=sentence))
     return Summary(
-        f"{count} Gaussians, {len(tiles)} tiles, {size / 2**20:.0f} MiB",
+        f"{count} Gaussians, {len(tiles)} tiles, {size / 2**20:.0f} MiB; all {len(levels)} levels: "
+        f"{values['held']} Gaussians",
         values,
-        warnings=merged if in_glb < count else (),
+        warnings=tuple(warnings),
         cautions=splat.placement.cautions,
     )
 
@@ -126,6 +151,25 @@ class Tiling:
     compression: Compression = "spz"
 
 
+def _without_finest(
+    folder: Path, whole: DetailTile, sidecar: GeorefSidecar, options: ExportTilesOptions
+) -> DetailTile:
+    """Return the tree of tiles within the budget, and remove the contents of all others."""
+    root = within_budget(whole, options.budget)
+    dropped = {tile.name for tile in whole.all()} - {tile.name for tile in root.all()}
+    if dropped:
+        _write_tileset(folder, root, sidecar, options.compression)
+        for name in dropped:
+            (folder / _content_uri(name)).unlink()
+    return root
+
+
+def _level(folder: Path, tiles: Sequence[DetailTile]) -> dict[str, int]:
+    """Return the sums of a level: tiles, Gaussians, bytes of the contents."""
+    sizes = [(folder / _content_uri(tile.name)).stat().st_size for tile in tiles]
+    return {"tiles": len(tiles), "gaussians": sum(tile.count for tile in tiles), "bytes": sum(sizes)}
+
+
 def write_tiles(
     folder: Path, parts: Iterable[SplatArrays], tiling: Tiling, sidecar: GeorefSidecar, progress: Progress = SILENT
 ) -> DetailTile:
@@ -143,9 +187,13 @@ def write_tiles(
             task.advance(len(content) if is_leaf else 0, note=f"tile {name}")
 
         root = build_tiles(parts, tiling.extent, Tiler(tiling.largest_tile, write))
-    text = json.dumps(_tileset(root, sidecar, tiling.compression), separators=(",", ":"), ensure_ascii=False)
-    replace_text(folder / TILESET, text + "\n")
+    _write_tileset(folder, root, sidecar, tiling.compression)
     return root
+
+
+def _write_tileset(folder: Path, root: DetailTile, sidecar: GeorefSidecar, compression: Compression) -> None:
+    text = json.dumps(_tileset(root, sidecar, compression), separators=(",", ":"), ensure_ascii=False)
+    replace_text(folder / TILESET, text + "\n")
 
 
 def write_whole(

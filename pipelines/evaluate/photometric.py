@@ -18,8 +18,9 @@ from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray
 from pipelines.geometry.footprints import PointSurface, ground_points
 from pipelines.report.plots.charts import labelled
-from pipelines.splat.exposure import fitted_affine, squared_radius, with_affine, with_vignetting
+from pipelines.splat.exposure import fitted_affine, with_affine
 from pipelines.splat.metrics import Lpips, psnr, ssim
+from pipelines.surface.photometry import photograph_and_mask, through_lens
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.photographs import DIFFERENCE_GAIN
 from pipelines.survey.report import PhotometricFigures, ViewFigures
@@ -92,10 +93,9 @@ def compare_test_views(
         for place, index in enumerate(indices):
             name = renderer.trained.sparse.image_name[index]
             seen = renderer.render(index)
-            render = _through_lens(renderer, index, seen.colour.cpu()).clamp(0, 1)
+            render = through_lens(renderer, index, seen.colour.cpu()).clamp(0, 1)
             over_white = seen.colour + (1 - seen.alpha)[..., None] * _to_white(renderer)
-            photo = torch.from_numpy(np.array(renderer.images.image(index))).float() / 255.0
-            mask = torch.from_numpy(np.array(renderer.images.mask(index)))
+            photo, mask = photograph_and_mask(renderer, index)
             covered = coverage.covered(index)
             covered = None if covered is None else covered & mask
             affine = fitted_affine(render, photo, mask)
@@ -106,7 +106,7 @@ def compare_test_views(
                 ssim=ssim(render, photo, mask),
                 lpips=None if distance is None else distance(render, photo, mask),
                 covered_share=None if covered is None else float(covered.sum() / mask.sum()),
-                psnr_over_white=psnr(_through_lens(renderer, index, over_white.cpu()).clamp(0, 1), photo, mask),
+                psnr_over_white=psnr(through_lens(renderer, index, over_white.cpu()).clamp(0, 1), photo, mask),
                 psnr_covered=None if covered is None or not covered.any() else psnr(render, photo, covered),
             )
             views.append(figures)
@@ -126,18 +126,6 @@ def _to_white(renderer: ModelRenderer) -> Tensor:
     """Return what a render (…, 3) over the model's background lacks where nothing lies, to be one over white."""
     background = torch.tensor(renderer.trained.model.background, dtype=torch.float32)
     return (1 - background).to(renderer.device)
-
-
-def _through_lens(renderer: ModelRenderer, index: int, colour: Tensor) -> Tensor:
-    """Return colours (H, W, 3) of a render as the lens and the exposure of its photograph show them."""
-    trained = renderer.trained
-    camera_id, pinhole = int(trained.sparse.image_camera_id[index]), renderer.pinholes.of(index)
-    lens = next((lens for lens in trained.model.vignetting if lens.camera_id == camera_id), None)
-    if lens is not None:
-        radius2 = squared_radius(pinhole, pinhole, colour.device)
-        colour = with_vignetting(colour, radius2, torch.tensor(lens.coefficients))
-    exposure = trained.model.cameras[index].exposure
-    return colour if exposure is None else with_affine(colour, torch.tensor(exposure))
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

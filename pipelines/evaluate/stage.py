@@ -288,7 +288,9 @@ def _rendered(
         files = CloudReader(options.reference, stated)
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(progress)
-    renderer = ModelRenderer(trained, images, rasterizer(options.backend, progress))
+    renderer = ModelRenderer(
+        trained, images, rasterizer(options.backend, progress, mip_filter=trained.model.mip_filter)
+    )
     renders, reference = stage.out / "renders", None
     renders.mkdir(parents=True, exist_ok=True)
     if files is not None:

@@ -1,7 +1,8 @@
 """PLY of 3D Gaussian Splatting: binary little-endian float32, as viewers and trainers exchange it.
 
 Properties: `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`. Opacity is a logit, scales are
-natural logarithms, the rotation is wxyz, `f_rest` is ordered by channel, the normals are zero.
+natural logarithms, the rotation is wxyz, `f_rest` is ordered by channel, the normals are zero. A comment says which
+Gaussians need the mip filter, in the words of Brush.
 """
 
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ _NORMAL = ("nx", "ny", "nz")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+MIP_COMMENT = "SplatRenderMode: mip"
 _REST_COUNTS = (0, 9, 24, 45)  # degree 0 to 3: three channels of (degree + 1)² − 1
 # Kind of numpy of each type; its digit is the width in bytes.
 PLY_TYPES = {
@@ -42,8 +44,8 @@ class SplatArrays(Rows):
     sh: Float32Array
 
 
-def write_splat_ply(path: Path, splat: SplatArrays) -> None:
-    """Write Gaussians; the file appears whole or not at all.
+def write_splat_ply(path: Path, splat: SplatArrays, *, mip_filter: bool = False) -> None:
+    """Write Gaussians, trained with the mip filter or not; the file appears whole or not at all.
 
     Raises:
         ValueError: shapes do not agree.
@@ -62,10 +64,11 @@ def write_splat_ply(path: Path, splat: SplatArrays) -> None:
     vertices = rows.view([(name, "<f4") for name in names]).reshape(count)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as draft:
-        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(draft))
+        comments = [MIP_COMMENT] if mip_filter else []
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments).write(str(draft))
 
 
-def join_splat_plys(parts: Sequence[Path], path: Path) -> int:
+def join_splat_plys(parts: Sequence[Path], path: Path, *, mip_filter: bool = False) -> int:
     """Write the Gaussians of files of one SH degree into one file, and return their number.
 
     No more than one part is in memory; the file appears whole or not at all.
@@ -80,7 +83,8 @@ def join_splat_plys(parts: Sequence[Path], path: Path) -> int:
             raise InputError("properties-differ", message, path=ply.path)
     count = sum(len(ply.rows) for ply in plys)
     with replacing(path) as draft, draft.open("wb") as stream:
-        lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+        lines = ["ply", "format binary_little_endian 1.0", *([f"comment {MIP_COMMENT}"] if mip_filter else [])]
+        lines += [f"element vertex {count}"]
         lines += [*(f"property float {name}" for name in plys[0].names), "end_header\n"]
         stream.write("\n".join(lines).encode("ascii"))
         for ply in plys:

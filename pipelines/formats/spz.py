@@ -40,6 +40,7 @@ _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, degree, fractional bits, flags, reserved or streams
 _HEADER4_BYTES = 32
 _TABLE_ROW = struct.Struct("<QQ")  # compressed bytes, bytes
+_ANTIALIASED = 1
 _HAS_EXTENSIONS = 0x2
 _POSITION_LIMIT = 1 << 23
 _GZIP_LEVEL, _ZSTD_LEVEL = 6, 12
@@ -75,16 +76,22 @@ class _Layout:
         return self.count * sum(self.widths)
 
 
-def write_spz(path: Path, splat: SplatArrays, version: SpzVersion = 3) -> None:
+def write_spz(path: Path, splat: SplatArrays, version: SpzVersion = 3, *, mip_filter: bool = False) -> None:
     """Write Gaussians; the file appears whole or not at all; raises as `encode_spz`."""
-    data = encode_spz(splat, version)
+    data = encode_spz(splat, version, mip_filter=mip_filter)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as draft:
         draft.write_bytes(data)
 
 
-def encode_spz(splat: SplatArrays, version: SpzVersion = 3, fractional_bits: int = FRACTIONAL_BITS) -> bytes:
-    """Return the bytes of an SPZ file.
+def encode_spz(
+    splat: SplatArrays,
+    version: SpzVersion = 3,
+    fractional_bits: int = FRACTIONAL_BITS,
+    *,
+    mip_filter: bool = False,
+) -> bytes:
+    """Return the bytes of an SPZ file, whose Gaussians need the mip filter or not.
 
     Opacities, colours, scales and harmonics beyond the format's range are clamped to it. Positions have steps of
     2^−bits m and lie within ±2^(23 − bits) m.
@@ -101,16 +108,16 @@ def encode_spz(splat: SplatArrays, version: SpzVersion = 3, fractional_bits: int
     _check_values(splat, fractional_bits)
     degree = int(np.sqrt(coefficients)) - 1
     layout = _Layout(version, count, degree, fractional_bits)
-    sections = _quantised(splat, layout)
+    sections, flags = _quantised(splat, layout), _ANTIALIASED if mip_filter else 0
     if version == 3:
-        head = _HEADER.pack(_MAGIC, 3, layout.count, degree, fractional_bits, 0, 0)
+        head = _HEADER.pack(_MAGIC, 3, layout.count, degree, fractional_bits, flags, 0)
         stream = zlib.compressobj(_GZIP_LEVEL, zlib.DEFLATED, 16 + zlib.MAX_WBITS)
         parts = [stream.compress(head), *(stream.compress(section.data) for section in sections), stream.flush()]
         return b"".join(parts)
     import zstandard
 
     packed = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(section.data) for section in sections]
-    head = _HEADER.pack(_MAGIC, 4, layout.count, degree, fractional_bits, 0, len(packed))
+    head = _HEADER.pack(_MAGIC, 4, layout.count, degree, fractional_bits, flags, len(packed))
     head += struct.pack("<I12x", _HEADER4_BYTES)
     table = [_TABLE_ROW.pack(len(part), section.size) for part, section in zip(packed, sections, strict=True)]
     return b"".join((head, *table, *packed))

@@ -73,9 +73,9 @@ def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
     return torch.stack(rows, dim=1).reshape(-1, 3, 3)
 
 
-def write_gaussians(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians as a 3DGS PLY; the file appears whole or not at all."""
-    write_splat_ply(path, SplatArrays(**gaussians.arrays()))
+def write_gaussians(path: Path, gaussians: Gaussians, *, mip_filter: bool = False) -> None:
+    """Write Gaussians, trained with the mip filter or not, as a 3DGS PLY; it appears whole or not at all."""
+    write_splat_ply(path, SplatArrays(**gaussians.arrays()), mip_filter=mip_filter)
 
 
 def read_gaussians(path: Path, rows: slice = slice(None)) -> Gaussians:

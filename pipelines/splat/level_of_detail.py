@@ -16,10 +16,11 @@ make the boxes of its tiles so large that a viewer always stands inside, and nev
 
 from __future__ import annotations
 
+import heapq
 import itertools
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -162,6 +163,13 @@ class DetailTile:
         for child in self.children:
             yield from child.all()
 
+    def levels(self) -> Iterator[tuple[DetailTile, ...]]:
+        """Yield the tiles of each level of the tree, from the root down."""
+        level: tuple[DetailTile, ...] = (self,)
+        while level:
+            yield level
+            level = tuple(child for tile in level for child in tile.children)
+
 
 def build_tiles(parts: Iterable[SplatArrays], box: FloatArray, tiler: Tiler) -> DetailTile:
     """Return the root of the tree of tiles, and write the content of each tile.
@@ -198,6 +206,28 @@ def best_cut(root: DetailTile, most: int) -> list[DetailTile]:
             return shown
         shown.remove(coarsest)
         shown += coarsest.children
+
+
+def within_budget(root: DetailTile, most: int) -> DetailTile:
+    """Return the tree without its finest tiles, so that all tiles together have no more than so many Gaussians.
+
+    The tile with the largest error gets its children first, as long as there is room: what is left has one detail
+    everywhere. The root stays in any case.
+    """
+    total, kept, waiting = root.count, set[str](), [(-root.error_m, root.name, root)]
+    while waiting:
+        _, name, tile = heapq.heappop(waiting)
+        total += sum(child.count for child in tile.children)
+        if total > most:
+            break
+        kept.add(name)
+        for child in tile.children:
+            heapq.heappush(waiting, (-child.error_m, child.name, child))
+
+    def cut(tile: DetailTile) -> DetailTile:
+        return replace(tile, children=tuple(map(cut, tile.children)) if tile.name in kept else ())
+
+    return cut(root)
 
 
 def coarser(splat: SplatArrays, most: int) -> Iterator[SplatArrays]:

@@ -95,7 +95,7 @@ def measured_ground(solved: SolvedSurvey, workspace: Workspace, progress: Progre
             log.warning("%s; it is made again", error)
     trained = solved if isinstance(solved, TrainedSurvey) else load_trained(workspace)
     images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-    renderer = ModelRenderer(trained, images, rasterizer("auto", progress))
+    renderer = ModelRenderer(trained, images, rasterizer("auto", progress, mip_filter=trained.model.mip_filter))
     found = measured_by(renderer, progress)
     try:
         found.save(path)

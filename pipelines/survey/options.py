@@ -83,3 +83,13 @@ class FilledAreaOptions(AreaOptions):
         f"all: all ground that {LEAST_PHOTOGRAPHS} photographs see. Without it: all inside a --boundary, else two "
         "metres and ten pixels of the photographs on the ground, at most a tenth of the area.",
     )
+
+
+class CropOptions(FilledAreaOptions):
+    """Options of everything that holds the Gaussians of an area."""
+
+    crop: bool = Field(
+        False, description="Leave out Gaussians outside the area of interest. --boundary implies it."
+    )
+    keep_sky: bool = Field(False, description="With a crop: keep what lies higher than all cameras.")
+    min_opacity: float = Field(0.005, ge=0, lt=1, description="Leave out Gaussians that are less opaque.")

@@ -141,6 +141,7 @@ class TrainedModel(Adjustment):
     iterations: int
     gaussians: int
     backend: Literal["cpu", "cuda"]
+    mip_filter: bool = False  # whether opacities make up for the dilation of renders, in training and ever after
 
 
 def load_solution(workspace: Workspace) -> Adjustment:

@@ -179,6 +179,11 @@ class GaussianOptions(StageOptions):
     strategy: Literal["default", "mcmc", "fast"] = Field(
         "default", description="Densification: as in 3DGS, by MCMC, or by errors in several views (fast)."
     )
+    mip_filter: bool = Field(
+        False,
+        description="Let opacities make up for the dilation of small Gaussians, so that the model keeps its look "
+        "zoomed out; viewers must know it.",
+    )
     coarse_to_fine: bool = Field(True, description="Start with photographs of lower resolution.")
     exposure: bool = Field(True, description="Fit the exposure of each training photograph.")
     robust_photometric: bool = Field(

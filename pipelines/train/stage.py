@@ -26,6 +26,7 @@ from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.splat.rasterizer.mip_filter import MipFiltered
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader
@@ -70,7 +71,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         GeorefError: a product or a photograph cannot be read, or the scene has too few points.
     """
     # First, so that `--backend cuda` without a GPU fails at once.
-    backend = rasterizer(options.backend, stage.progress)
+    backend = rasterizer(options.backend, stage.progress, mip_filter=options.mip_filter)
     workspace = stage.workspace
     stated = CloudCrs(options.lidar_crs, options.lidar_vertical)
     clouds = None if options.lidar is None else CloudReader(options.lidar, stated)
@@ -120,7 +121,6 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     if refines:
         posterior = adjusted.posterior(measured, problem.state())
     model = _write_solution(stage, trainer, adjusted.adjustment, posterior)
-    write_gaussians(stage.out / "gaussians.ply", trainer.optimizer.gaussians.detached())
     metrics = [json.loads(row) for row in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
     return _summary(model, metrics, record, None if lidar is None else lidar.report)
 
@@ -138,6 +138,8 @@ def _write_solution(
     """Write and return the product of a training, of which `frozen` is the adjustment if there is no posterior."""
     model = trained_model(trainer, frozen if posterior is None else posterior.solution)
     save_json(model, stage.out / Path(MODEL).name)
+    gaussians = trainer.optimizer.gaussians.detached()
+    write_gaussians(stage.out / "gaussians.ply", gaussians, mip_filter=model.mip_filter)
     path = stage.out / Path(TRAIN_POSTERIOR).name
     if posterior is None:
         shutil.copyfile(stage.workspace.path(SIM3_POSTERIOR), path)
@@ -166,6 +168,7 @@ def trained_model(trainer: JointTrainer, solution: Adjustment) -> TrainedModel:
         iterations=trainer.iteration,
         gaussians=len(gaussians),
         backend=trainer.rasterizer.name,
+        mip_filter=isinstance(trainer.rasterizer, MipFiltered),
     )
 
 

@@ -66,7 +66,7 @@ class Viewer:
             trained = load_trained(workspace)
             task.advance()
             images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-            backend = rasterizer(options.backend, progress)
+            backend = rasterizer(options.backend, progress, mip_filter=trained.model.mip_filter)
             renderer = ModelRenderer(trained, images, backend)
             self.model = MeasuringModel(workspace, renderer, options)
             task.advance()

@@ -26,10 +26,10 @@ from pipelines.deliver.splat import codec_arrays, load_splat
 from pipelines.deliver.tiles import read_glb, run, write_glb, write_whole
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
 from pipelines.formats.splat_ply import SplatArrays, write_splat_ply
-from pipelines.splat.level_of_detail import DetailTile
+from pipelines.splat.level_of_detail import DetailTile, within_budget
 from pipelines.survey.block_plan import BlockCell, BlockRecord, MergedBlock
 from tests.delivered_scenes import block_training, splat_arrays, true_ecef, write_trained
-from tests.refusals import numbers, refused
+from tests.refusals import numbers, refused, said
 
 COUNT = 2600
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF's axes to those of 3D Tiles
@@ -252,3 +252,45 @@ def test_page_shows_ellipsoidal_heights_where_a_grid_is_missing(made: StageRun, 
     with pytest.raises(InputError, match="grid"):
         run(stage, ExportTilesOptions(crs="EPSG:32630+3855"))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("budget", "compression"), [(1000, "spz"), (2500, "spz"), (2500, "none")])
+def test_all_levels_stay_within_the_budget(
+    tmp_path: Path, scene: SplatArrays, budget: int, compression: str
+) -> None:
+    stage = write_trained(tmp_path / "ws", scene, "tiles")
+    options = {"max_tile_gaussians": 1000, "budget": budget, "compression": compression}
+    summary = run(stage, ExportTilesOptions.model_validate(options))
+    tiles = all_tiles(document(stage)["root"])
+    counts = {tile["content"]["uri"]: len(read_glb(stage.out / tile["content"]["uri"])) for tile in tiles}
+    assert sum(counts.values()) == summary.values["held"] <= budget
+    # No other contents are left, the levels' sums are those of the files, and the whole is in the one glb.
+    assert {f"content/{path.name}" for path in (stage.out / "content").iterdir()} == set(counts)
+    levels = summary.values["levels"]
+    assert [sum(level[name] for level in levels) for name in ("tiles", "gaussians")] == [
+        len(tiles),
+        sum(counts.values()),
+    ]
+    sizes = [(stage.out / name).stat().st_size for name in counts]
+    assert sum(level["bytes"] for level in levels) == sum(sizes)
+    assert summary.values["glb_gaussians"] == COUNT
+    finest = sum(counts[tile["content"]["uri"]] for tile in tiles if "children" not in tile)
+    assert finest == summary.values["finest"] < COUNT
+    sentence = said(summary.warnings, "tiles-coarser")
+    assert numbers(sentence)[:3] == [finest, COUNT, budget]
+
+
+def test_finest_tiles_are_left_out_everywhere_alike() -> None:
+    """The tile with the largest error gets its children first; the tree stays one."""
+
+    def tile(name: str, count: int, error_m: float, *children: DetailTile) -> DetailTile:
+        return DetailTile(name, count, error_m, np.zeros((2, 3)), children)
+
+    fine = [tile(f"a{k}", 50, 0.0) for k in range(2)], [tile(f"b{k}", 30, 0.0) for k in range(2)]
+    root = tile("r", 10, 8.0, tile("a", 40, 4.0, *fine[0]), tile("b", 20, 2.0, *fine[1]))
+    names = {most: sorted(one.name for one in within_budget(root, most).all()) for most in (5, 70, 169, 170, 230)}
+    assert names[5] == ["r"]
+    assert names[70] == names[169] == ["a", "b", "r"]
+    assert names[170] == ["a", "a0", "a1", "b", "r"]
+    assert names[230] == sorted(one.name for one in root.all())
+    assert [len(level) for level in root.levels()] == [1, 2, 4]

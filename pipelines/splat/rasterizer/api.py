@@ -3,7 +3,9 @@
 The blending is that of 3D Gaussian Splatting (doi 10.1145/3592433), with gsplat's conventions:
 
 1. Pixel centres lie at (0.5, 0.5).
-2. The screen covariance is dilated by `dilation_px2`.
+2. The screen covariance C is dilated by `dilation_px2`. With `mip_filter`, the opacity is multiplied by
+   √(|C| / |C dilated|), so that a Gaussian of less than a pixel keeps its light (the 2-D filter of Mip-Splatting,
+   doi 10.1109/CVPR52733.2024.01839).
 3. Contributions below alpha 1/255 are left out, and alpha is at most 0.999.
 4. A pixel is done when its transmittance would fall to 1e-4.
 5. Gaussians are ordered by the depth of their centres.
@@ -72,6 +74,7 @@ class RasterSettings:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     near_m: float = 0.05  # Gaussians with a nearer centre are left out
     dilation_px2: float = 0.3  # added to the diagonal of the screen covariance, in px²
+    mip_filter: bool = False  # whether the opacity makes up for the dilation
     depth: bool = False  # colour and alpha are always computed
     normal: bool = False
     median: bool = True  # depth; training needs none, and on a GPU it costs more than all the rest

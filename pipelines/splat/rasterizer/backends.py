@@ -8,6 +8,7 @@ import torch
 from pipelines.core.errors import BackendUnavailableError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.splat.rasterizer.api import BackendName, Rasterizer
+from pipelines.splat.rasterizer.mip_filter import MipFiltered
 
 BACKENDS: tuple[BackendName, ...] = ("cpu", "cuda")
 
@@ -36,13 +37,20 @@ def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
     return "cpu"
 
 
-def rasterizer(name: Literal["auto", "cpu", "cuda"], progress: Progress = SILENT) -> Rasterizer:
-    """Return the backend that a name stands for, see `chosen_backend`.
+def rasterizer(
+    name: Literal["auto", "cpu", "cuda"], progress: Progress = SILENT, *, mip_filter: bool = False
+) -> Rasterizer:
+    """Return the backend that a name stands for, see `chosen_backend`, with the mip filter in all renders or not.
 
     Raises:
         BackendUnavailableError: `cuda`, and a part that it needs is missing, or its kernels cannot be compiled;
             `progress` shows their compilation before their first use on a machine.
     """
+    backend = _plain(name, progress)
+    return MipFiltered(backend) if mip_filter else backend
+
+
+def _plain(name: Literal["auto", "cpu", "cuda"], progress: Progress) -> Rasterizer:
     if chosen_backend(name) == "cuda":
         from pipelines.splat.rasterizer.cuda import CudaRasterizer
 

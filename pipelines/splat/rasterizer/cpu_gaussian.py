@@ -177,6 +177,7 @@ class View(NamedTuple):
     slope_y_max: float
     near: float
     dilation: float
+    mip_filter: bool
     stretch_x: float
     stretch_y: float
 
@@ -203,6 +204,7 @@ def make_view(camera: Pinhole, settings: RasterSettings, pose: FloatArray) -> Vi
         slope_y_max=slope_y_max,
         near=float(settings.near_m),
         dilation=float(settings.dilation_px2),
+        mip_filter=settings.mip_filter,
         stretch_x=camera.fx * norm * math.hypot(1.0, max(-slope_x_min, slope_x_max)),
         stretch_y=camera.fy * norm * math.hypot(1.0, max(-slope_y_min, slope_y_max)),
     )
@@ -317,6 +319,31 @@ def screen_covariance(axes: Any, variance: Any, dilation: float) -> Any:
         axes[0] * axes[3] * a + axes[1] * axes[4] * b + axes[2] * axes[5] * c,
         axes[3] * axes[3] * a + axes[4] * axes[4] * b + axes[5] * axes[5] * c + dilation,
     )
+
+
+@jit
+def log_compensation(cov: Any, dilation: float) -> float:
+    """Return ln √(|C less its dilation| / |C|) of C (xx, xy, yy); −∞: seen edge-on, nothing is left."""
+    xx, xy, yy = cov
+    before = (xx - dilation) * (yy - dilation) - xy * xy
+    return 0.5 * math.log(before / (xx * yy - xy * xy)) if before > 0.0 else -math.inf
+
+
+@jit
+def log_opacity(logit: float, cov: Any, view: View) -> float:
+    """Return ln of the opacity on the screen, given C (xx, xy, yy)."""
+    plain = log_sigmoid(logit)
+    return plain + log_compensation(cov, view.dilation) if view.mip_filter else plain
+
+
+@jit
+def compensation_gradient(cov: Any, dilation: float) -> Any:
+    """Return the symmetric ∂/∂C (xx, xy, yy) of `log_compensation`: ½ (C less its dilation)⁻¹ − ½ C⁻¹."""
+    xx, xy, yy = cov
+    after = 0.5 / (xx * yy - xy * xy)
+    nxx, nyy = xx - dilation, yy - dilation
+    before = 0.5 / (nxx * nyy - xy * xy)
+    return nyy * before - yy * after, -xy * before + xy * after, nxx * before - xx * after
 
 
 @jit

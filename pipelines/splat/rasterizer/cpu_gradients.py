@@ -53,6 +53,10 @@ def _covariance_gradients(axes: Any, variance: Any, view: View, depth: float, su
     """Return ∂L/∂ screen mean (2), depth of the centre, screen covariance (3), covariance with the depth (2)."""
     cov = gaussian.screen_covariance(axes, variance, view.dilation)
     (gu, gv), (xx, xy, yy) = _conic_gradients(cov, sums)
+    if view.mip_filter:
+        # ln α has the logarithm of the compensation as a term.
+        of_xx, of_xy, of_yy = gaussian.compensation_gradient(cov, view.dilation)
+        xx, xy, yy = xx + sums[Q] * of_xx, xy + sums[Q] * of_xy, yy + sums[Q] * of_yy
     g_depth, g_slope = sums[D_DEPTH], (sums[D_SLOPE_X], sums[D_SLOPE_Y])
     if g_depth == 0.0 and g_slope[0] == 0.0 and g_slope[1] == 0.0:
         # True of every render without depth.

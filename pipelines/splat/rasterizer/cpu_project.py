@@ -74,7 +74,9 @@ def _is_visible(means: Any, quats: Any, log_scales: Any, logit: float, pose: Any
     point, (xx, xy, yy), _ = _ellipse(means, quats, log_scales, pose, view, i)
     if not (xx * yy - xy * xy > 0.0 and xx < math.inf and yy < math.inf):
         return False
-    level = 2.0 * (gaussian.log_sigmoid(logit) - LOG_ALPHA_MIN)
+    level = 2.0 * (gaussian.log_opacity(logit, (xx, xy, yy), view) - LOG_ALPHA_MIN)
+    if not level >= 0.0:
+        return False
     u = view.fx * point[0] / point[2] + view.cx
     v = view.fy * point[1] / point[2] + view.cy
     return _holds_pixel(u, math.sqrt(level * xx), view.width) and _holds_pixel(
@@ -86,6 +88,8 @@ def _is_visible(means: Any, quats: Any, log_scales: Any, logit: float, pose: Any
 def _is_surely_visible(quats: Any, log_scales: Any, logit: float, point: Any, view: View, i: int) -> bool:
     """Return True only for a centre in the image whose ellipse holds a pixel by the image's dilation alone.
 
+    With the filter, opacities depend on the ellipse.
+
     An ellipse that reaches half a pixel each way holds one. This test of most Gaussians is cheaper than their
     ellipse, and is False where an infinite or NaN quaternion or scale would make that invisible.
     """
@@ -95,7 +99,8 @@ def _is_surely_visible(quats: Any, log_scales: Any, logit: float, point: Any, vi
     a, b, c = gaussian.row3(log_scales, i)
     turn = abs(quats[i, 0]) + abs(quats[i, 1]) + abs(quats[i, 2]) + abs(quats[i, 3])
     return (
-        0.0 <= u <= view.width
+        not view.mip_filter
+        and 0.0 <= u <= view.width
         and 0.0 <= v <= view.height
         and level * view.dilation >= 0.25
         and abs(a) + abs(b) + abs(c) < _ORDINARY
@@ -173,7 +178,8 @@ def _project_visible(
             i = visible[row]
             (x, y, z), cov, slope = _ellipse(means, quats, log_scales, pose, view, i)
             on_screen = (view.fx * x / z + view.cx, view.fy * y / z + view.cy)
-            _write_splat(splats, ellipses, row, on_screen, cov, gaussian.log_sigmoid(float(logit_opacities[i])))
+            log_opacity = gaussian.log_opacity(float(logit_opacities[i]), cov, view)
+            _write_splat(splats, ellipses, row, on_screen, cov, log_opacity)
             direction, _ = gaussian.unit_direction(gaussian.row3(means, i), center)
             gaussian.sh_basis(direction, degree, basis)
             red, green, blue = gaussian.sh_colour(sh, i, basis, (degree + 1) ** 2)

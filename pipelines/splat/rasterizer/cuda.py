@@ -58,6 +58,7 @@ class CudaRasterizer:
             eps2d=settings.dilation_px2,
             sh_degree=settings.sh_degree,
             packed=True,
+            rasterize_mode="antialiased" if settings.mip_filter else "classic",
         )
         # gsplat refuses a background for packed Gaussians.
         colour = image[0] + (1 - alpha[0]) * _row(settings.background, device)

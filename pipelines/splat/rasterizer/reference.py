@@ -43,7 +43,10 @@ def render_reference(
     rows, columns = (torch.arange(count, dtype=dtype) + 0.5 for count in (camera.height, camera.width))
     v, u = torch.meshgrid(rows, columns, indexing="ij")
     offset_px = torch.stack([u.reshape(-1), v.reshape(-1)], dim=-1) - mean_px[:, None]
-    alpha = _alpha(offset_px, cov_px2, torch.sigmoid(sorted_gaussians.logit_opacities))
+    opacity = torch.sigmoid(sorted_gaussians.logit_opacities)
+    if settings.mip_filter:
+        opacity = opacity * compensation(cov_px2, settings.dilation_px2)
+    alpha = _alpha(offset_px, cov_px2, opacity)
 
     after = torch.cumprod(1 - alpha, dim=0)
     counted = after > TRANSMITTANCE_MIN
@@ -71,7 +74,7 @@ def render_reference(
     normal = None
     if settings.normal:
         normal = torch.einsum("gp,gc->pc", weight, facing_normals(sorted_gaussians, pose)).view(*size, 3)
-    stats = _screen_stats(front, mean_px, cov_px2, sorted_gaussians.logit_opacities, camera)
+    stats = _screen_stats(front, mean_px, cov_px2, opacity, camera)
     view = Render(colour.view(*size, 3), (1 - final).view(size), stats, expected, variance, median, normal)
     return view if settings.window is None else settings.window.cut(view)
 
@@ -85,6 +88,14 @@ def project_gaussians(
     cov_px2 = axes @ axes.mT + dilation_px2 * torch.eye(2, dtype=z.dtype)
     mean_px = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
     return mean_px, cov_px2
+
+
+def compensation(cov_px2: Tensor, dilation_px2: float) -> Tensor:
+    """Return the factors (N,) of the opacity that make up for the dilation of screen covariances (N, 2, 2)."""
+    xx, xy, yy = cov_px2[:, 0, 0], cov_px2[:, 0, 1], cov_px2[:, 1, 1]
+    before = (xx - dilation_px2) * (yy - dilation_px2) - xy * xy
+    # A root has no slope at zero: what is seen edge-on is invisible.
+    return torch.where(before > 0, before, 1e-12).sqrt() / (xx * yy - xy * xy).sqrt()
 
 
 def depth_slopes(axes: Tensor, depth: Tensor, dilation_px2: float) -> Tensor:
@@ -155,12 +166,10 @@ def _alpha(offset_px: Tensor, cov_px2: Tensor, opacity: Tensor) -> Tensor:
     return torch.where(alpha >= ALPHA_MIN, alpha.clamp(max=ALPHA_MAX), 0.0)
 
 
-def _screen_stats(
-    rows: Tensor, mean_px: Tensor, cov_px2: Tensor, logit_opacities: Tensor, camera: Pinhole
-) -> ScreenStats:
+def _screen_stats(rows: Tensor, mean_px: Tensor, cov_px2: Tensor, opacity: Tensor, camera: Pinhole) -> ScreenStats:
     with torch.no_grad():
         # alpha ≥ ALPHA_MIN is an ellipse: 2 ln(opacity / ALPHA_MIN) is its squared Mahalanobis radius.
-        level = 2 * (torch.nn.functional.logsigmoid(logit_opacities) - math.log(ALPHA_MIN))
+        level = 2 * (torch.log(opacity) - math.log(ALPHA_MIN))
         extent = torch.sqrt(level.clamp_min(0)[:, None] * torch.diagonal(cov_px2, dim1=1, dim2=2))
         size = torch.tensor([camera.width, camera.height], dtype=mean_px.dtype)
         first = torch.ceil(mean_px - extent - 0.5).clamp_min(0)

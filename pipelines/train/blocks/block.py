@@ -40,7 +40,7 @@ _LAST_ROWS = 20
 
 def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     """Train the block, and return its figures; errors as of `train.stage.run`, or too few photographs show it."""
-    backend, workspace = rasterizer(options.backend), stage.workspace
+    backend, workspace = rasterizer(options.backend, mip_filter=options.mip_filter), stage.workspace
     block = load_json(BlockPlan, workspace.path(BLOCK_PLAN)).block(options.id)
     whole = AdjustedScene.load(workspace, SOLUTION)
     box = SceneBox.around(whole.scene.point_in_model)

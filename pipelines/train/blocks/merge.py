@@ -78,7 +78,7 @@ class SeamViews:
 
     def __init__(self, parts: Parts, plan: BlockPlan, solution: Adjustment) -> None:
         self._parts, self._plan = parts, plan
-        self._backend: Rasterizer = rasterizer(parts.options.backend)
+        self._backend: Rasterizer = rasterizer(parts.options.backend, mip_filter=parts.options.mip_filter)
         self._device = self._backend.device
         self._poses = solution.poses
         self._sfm = solution.with_lenses(read_sparse(parts.workspace.path(stages.SPARSE)))
@@ -140,7 +140,7 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
     trainings = parts.trainings(plan)
     # The Gaussians of each cell, adapted to those of its neighbours.
     cells = [parts.variant().root / stages.TRAIN_SEAMS.folder / f"{block.id}.ply" for block in plan.blocks]
-    count = join_splat_plys(cells, folder / "gaussians.ply")
+    count = join_splat_plys(cells, folder / "gaussians.ply", mip_filter=parts.options.mip_filter)
     solution = load_json(Adjustment, parts.variant().path(stages.SOLUTION))
     model = TrainedModel(
         **dict(solution),
@@ -150,6 +150,7 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
         iterations=max(training.iterations for training in trainings),
         gaussians=count,
         backend=trainings[0].backend,
+        mip_filter=parts.options.mip_filter,
     )
     save_json(model, folder / Path(stages.MODEL).name)
     # Blocks keep the adjustment of init-sim3, and with it the covariances.

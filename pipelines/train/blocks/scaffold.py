@@ -25,7 +25,7 @@ _MOST_ITERATIONS, _MOST_LOOKS = 3_000, 10_000
 
 def run(stage: StageRun, options: TrainOptions) -> Summary:
     """Train the scaffold, and return its key figures; errors are those of `train.stage.run`."""
-    backend, workspace = rasterizer(options.backend), stage.workspace
+    backend, workspace = rasterizer(options.backend, mip_filter=options.mip_filter), stage.workspace
     solved = AdjustedScene.load(workspace, SOLUTION)
     coarse = coarse_options(options, len(solved.scene.train))
     images = photographs(solved.scene.sparse, solved.survey, workspace, coarse.effort.max_image_size)

@@ -43,7 +43,11 @@ _DONE = "done.txt"  # number of trained seams
 
 def run(stage: StageRun, options: SeamOptions) -> Summary:
     """Train all seams, and return their figures; a KeyboardInterrupt: asked to stop; those that ended are kept."""
-    workspace, backend, done = stage.workspace, rasterizer(options.backend), stage.out / _DONE
+    workspace, backend, done = (
+        stage.workspace,
+        rasterizer(options.backend, mip_filter=options.mip_filter),
+        stage.out / _DONE,
+    )
     plan = load_json(BlockPlan, workspace.path(BLOCK_PLAN))
     solved = AdjustedScene.load(workspace, SOLUTION)
     images = photographs(solved.scene.sparse, solved.survey, workspace, options.effort.max_image_size)

@@ -21,20 +21,22 @@ BACKGROUND = (0.2, 0.5, 0.9)
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize(
-    # Number of Gaussians, logarithm of their size, degree of the harmonics, with depth and normals or without.
+    # Number of Gaussians, logarithm of their size, degree of the harmonics; with depth, normals, mip filter.
     "case",
     [
-        (150, -2.0, 3, True, True),
-        (150, -1.0, 2, True, False),
-        (400, -3.0, 1, False, True),
-        (60, 0.3, 0, True, True),
-        (200, -2.0, 1, False, False),
+        (150, -2.0, 3, True, True, False),
+        (150, -1.0, 2, True, False, False),
+        (400, -3.0, 1, False, True, False),
+        (60, 0.3, 0, True, True, False),
+        (200, -2.0, 1, False, False, False),
+        (150, -2.0, 2, True, True, True),
+        (400, -3.5, 1, False, False, True),
     ],
 )
 def test_images_and_gradients(make_scene, leaves, loss_of, camera, dtype, case):
-    count, log_scale, degree, depth, normal = case
+    count, log_scale, degree, depth, normal, mip_filter = case
     scene = make_scene(count, seed=count, log_scale=log_scale)
-    settings = RasterSettings(sh_degree=degree, background=BACKGROUND, depth=depth, normal=normal)
+    settings = RasterSettings(degree, BACKGROUND, depth=depth, normal=normal, mip_filter=mip_filter)
     (expected_gaussians, expected_pose), (gaussians, pose) = leaves(scene, torch.float64), leaves(scene, dtype)
     expected = render_reference(expected_gaussians, expected_pose, camera, settings)
     render = CpuRasterizer().render(gaussians, pose, camera, settings)
@@ -76,14 +78,15 @@ def test_window_is_a_part_of_the_image(make_scene, leaves, camera, window):
 @pytest.mark.usefixtures("one_thread")
 # The last ones reach so far towards the camera that the slopes of their depths are shortened.
 @pytest.mark.parametrize(
-    ("degree", "seed", "log_scale"),
+    ("degree", "seed", "log_scale", "mip_filter"),
     [
-        (3, 1, -1.0),
-        pytest.param(1, 2, -1.0, marks=pytest.mark.slow),
-        pytest.param(0, 3, 0.7, marks=pytest.mark.slow),
+        (3, 1, -1.0, False),
+        pytest.param(1, 2, -1.0, False, marks=pytest.mark.slow),
+        pytest.param(0, 3, 0.7, False, marks=pytest.mark.slow),
+        pytest.param(0, 4, -2.0, True, marks=pytest.mark.slow),
     ],
 )
-def test_gradcheck(make_scene, degree, seed, log_scale):
+def test_gradcheck(make_scene, degree, seed, log_scale, mip_filter):
     # More than one tile each way, and big Gaussians: rows, columns and tiles all end somewhere within them.
     (gaussians, pose), camera = (
         make_scene(4, seed=seed, degree=degree, log_scale=log_scale),
@@ -91,7 +94,7 @@ def test_gradcheck(make_scene, degree, seed, log_scale):
     )
 
     def images(*inputs):
-        settings = RasterSettings(sh_degree=degree, background=BACKGROUND, depth=True, normal=True)
+        settings = RasterSettings(degree, BACKGROUND, depth=True, normal=True, mip_filter=mip_filter)
         render = CpuRasterizer().render(Gaussians(*inputs[:5]), inputs[5], camera, settings)
         return render.colour, render.alpha, render.expected_depth, render.normal
 

@@ -29,6 +29,11 @@ def test_images_and_gradients(make_scene, camera, rasteriser, case):
     assert_parity(rasteriser, "cpu", make_scene(count, seed=count, log_scale=log_scale), camera, settings)
 
 
+def test_mip_filter_is_gsplats(make_scene, camera, rasteriser):
+    settings = RasterSettings(1, BACKGROUND, depth=True, normal=True, mip_filter=True)
+    assert_parity(rasteriser, "cpu", make_scene(150, seed=7, log_scale=-2.5), camera, settings)
+
+
 def test_depth_variance_and_without_median(make_scene, leaves, camera, rasteriser):
     scene = make_scene(60, seed=4, log_scale=-0.5)
     settings = RasterSettings(0, BACKGROUND, depth=True, median=False)

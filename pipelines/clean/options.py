@@ -1,0 +1,41 @@
+"""Options of `georef clean`."""
+
+from pydantic import Field
+
+from pipelines.survey.options import CropOptions
+
+
+class CleanOptions(CropOptions):
+    """Options of the cleaned model."""
+
+    floaters: bool = Field(
+        True,
+        description="Remove what floats: Gaussians before the surface that the photographs measure, or far from "
+        "all others, that are translucent or that the photographs contradict.",
+    )
+    floater_sigma: float = Field(
+        4.0,
+        ge=1,
+        le=100,
+        description="A Gaussian further before the surface floats, in σ of the surface's depth and of the Gaussian "
+        "along the ray.",
+    )
+    sh_degree: int | None = Field(
+        None,
+        ge=0,
+        le=3,
+        description="Largest degree of the spherical harmonics. Without it: that of the trained model.",
+    )
+    gaussians: int | None = Field(
+        None,
+        ge=1,
+        description="Largest number of Gaussians: those that show least in training views are merged into their "
+        "neighbours. Without it: all stay.",
+    )
+    appearance_passes: int = Field(
+        5,
+        ge=0,
+        le=1000,
+        description="With --gaussians or --sh-degree: passes over the training views, in which colours and "
+        "opacities of what stays are fitted to the renders of the trained model.",
+    )
