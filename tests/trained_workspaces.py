@@ -89,7 +89,9 @@ def write_adjustment(workspace: Workspace) -> None:
     state = replace(start_of(scene, problem), correction=correction, lens=lens)
     posterior = adjusted(scene, problem, state, made)
     solved = posterior.solution
-    update = {"measurements": solved.measurements, "sigma_px": solved.sigma_px, "accuracy": solved.accuracy}
+    update = {
+        name: getattr(solved, name) for name in ("measurements", "sigma_px", "sigma_datum_m", "earlier", "accuracy")
+    }
     save_json(model.model_copy(update=update), workspace.root / MODEL)
     save_posterior(posterior, workspace.root / TRAIN_POSTERIOR)
 

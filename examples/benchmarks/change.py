@@ -4,6 +4,10 @@ For each seed, three flights over one town are simulated and reconstructed: the 
 and a later one without any. Prints, for the changed pair, precision and recall of the significant cells, and the
 volumes with their errors; for the unchanged pair the false alarms. What stands in OUT already is not made again.
 
+With `--earlier`, the later flights are adjusted onto the first by points in common, without control points, and
+nothing is registered: the difference of the unchanged ground is then stated with its σ, and with what a
+registration would have found.
+
 A cell has truly changed if its height differs by more than `--least`, and is to be found if it differs by more than
 its level of detection too. Cells that both epochs measure count.
 """
@@ -25,6 +29,8 @@ from scipy.ndimage import map_coordinates
 
 from pipelines.core.products import load_json
 from pipelines.core.types import FloatArray
+from pipelines.core.workspace import Workspace
+from pipelines.deliver.raster_plan import ground_sampling_m
 from pipelines.formats.geotiff import frame_of, read_cells
 from pipelines.formats.vector_files import feature, features_text
 from pipelines.geodesy.crs import parse_crs
@@ -32,6 +38,7 @@ from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef, l
 from pipelines.simulate.stage import TRUE_HEIGHTS, TRUTH
 from pipelines.simulate.truth import TrueChange, Truth
 from pipelines.survey.change_report import Change
+from pipelines.survey.trained_survey import load_trained
 
 EPOCHS: dict[str, Sequence[str]] = {
     "first": (),
@@ -67,6 +74,12 @@ class PairFigures:
     false_alarms: float
     regions_of_no_change: int
     volumes: tuple[VolumeError, ...]
+    lod_m: float
+    gsd_m: float
+    # Of the unchanged pair: what a registration finds (east, north, up), and σ of the difference, h and v.
+    stable_shift_m: tuple[float, float, float]
+    stable_sigma_m: tuple[float, float] | None
+    common_points: int
 
 
 def main() -> None:
@@ -78,12 +91,16 @@ def main() -> None:
     parser.add_argument("--size", default="480x360", help="of the photographs")
     parser.add_argument("--flights", default="", help="further options of georef simulate for all flights")
     parser.add_argument("--later", default="", help="and for the later ones, such as --common-error 0,0,0.03")
+    parser.add_argument("--earlier", action="store_true", help="adjust the later flights onto the first")
     parser.add_argument("--no-control", action="store_true", help="reconstruct without the control points")
     parser.add_argument("--train", default="--preset fast --iterations 1200", help="options of georef run")
-    parser.add_argument("--change", default="--stable-auto", help="options of georef change")
+    parser.add_argument("--change", help="options of georef change; --stable-auto, or none with --earlier")
     parser.add_argument("--least", type=float, default=0.1, help="height in metres from which a cell has changed")
     parser.add_argument("--json", type=Path, help="file that keeps the figures")
     args = parser.parse_args()
+    if args.change is None:
+        args.change = "" if args.earlier else "--stable-auto"
+    args.no_control |= args.earlier
     every = []
     for seed in map(int, args.seeds.split(",")):
         figures = measured_pair(args, seed, args.out / f"seed_{seed}")
@@ -91,8 +108,16 @@ def main() -> None:
         print(
             f"seed {seed}, cells of {figures.cell_m:.2f} m: precision {figures.precision:.3f}, recall "
             f"{figures.recall:.3f}; without change {figures.false_alarms:.2%} false alarms, "
-            f"{figures.regions_of_no_change} regions"
+            f"{figures.regions_of_no_change} regions; level of detection {figures.lod_m:.3f} m, GSD "
+            f"{figures.gsd_m:.3f} m"
         )
+        if figures.stable_sigma_m is not None:
+            east, north, up = figures.stable_shift_m
+            print(
+                f"  {figures.common_points} points in common; unchanged ground {east:+.3f}, {north:+.3f}, "
+                f"{up:+.3f} m apart, σ {figures.stable_sigma_m[0]:.3f} m horizontal, "
+                f"{figures.stable_sigma_m[1]:.3f} m vertical"
+            )
         for one in figures.volumes:
             print(
                 f"  {one.name} {one.kind}: {one.net_m3:.1f} ± {one.sigma_m3:.1f} m³, true {one.true_m3:.1f} m³, "
@@ -113,6 +138,7 @@ def measured_pair(args: argparse.Namespace, seed: int, folder: Path) -> PairFigu
             )
         _georef(
             *("run", workspace, "--images", survey / "images", "--trajectory", survey / "trajectory.csv"),
+            *(("--earlier", folder / "first") if args.earlier and epoch else ()),
             *("--vertical", "ellipsoidal", *(() if args.no_control else ("--gcp", survey / "gcp_list.txt"))),
             *(*args.train.split(), "--deliver", "raster"),
         )
@@ -129,14 +155,20 @@ def measured_pair(args: argparse.Namespace, seed: int, folder: Path) -> PairFigu
     marked, changed = (classes > 1) & counts, np.abs(risen) > args.least
     change = load_json(Change, folder / "changed/change/change.json")
     still = read_cells(folder / "same/change/significant.tif")[0]
+    same = load_json(Change, folder / "same/change/change.json")
     return PairFigures(
         seed=seed,
         cell_m=change.cell_m,
         precision=float(changed[marked].mean()),
         recall=float(marked[counts & changed & (np.abs(risen) > lod)].mean()),
         false_alarms=float((still[still > 0] > 1).mean()),
-        regions_of_no_change=len(load_json(Change, folder / "same/change/change.json").regions),
+        regions_of_no_change=len(same.regions),
         volumes=tuple(_volume_errors(truth, truth.change, change, folder)),
+        lod_m=change.median_lod_m,
+        gsd_m=ground_sampling_m(load_trained(Workspace(folder / "first")))[0],
+        stable_shift_m=same.registration.shift_m,
+        stable_sigma_m=None if same.common is None else (same.common.sigma_h_m, same.common.sigma_v_m),
+        common_points=0 if same.common is None else same.common.used,
     )
 
 

@@ -47,6 +47,7 @@ LATER: dict[str, tuple[str, ...]] = {
     "mapper": ("sfm",),
     "import_model": ("sfm",),
     "triangulate": ("sfm",),
+    "earlier": ("sfm",),
     "max_residual": ("init-sim3",),
     "accept_inconsistency": ("ingest", "init-sim3"),
     **dict.fromkeys(_EFFORT, ("train",)),

@@ -140,7 +140,7 @@ def accuracy_grid(
     position = np.column_stack([middle[in_scene], np.median(point[near, 2], axis=1)])
     # Covariances vary slowly: of many cells, every other one in both directions stands for its neighbours.
     computed = (cell % 2 == 0).all(axis=1) if len(cell) > _MANY_CELLS else np.ones(len(cell), dtype=bool)
-    of_part = covariance(position[computed], *_seen_by(sparse.obs_point, sparse.obs_image, chosen[near[computed]]))
+    of_part = covariance(position[computed], *seen_by(sparse.obs_point, sparse.obs_image, chosen[near[computed]]))
     known = np.isfinite(of_part).all(axis=(1, 2))
     if not known.any():
         return None
@@ -153,7 +153,7 @@ def accuracy_grid(
     return AccuracyGrid(position, cov, cell, size, low, (columns, rows))
 
 
-def _seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[IntArray, IntArray]:
+def seen_by(obs_point: IntArray, obs_image: IntArray, near: IntArray) -> tuple[IntArray, IntArray]:
     """Return unique pairs (cell, camera), ordered by cell: cameras that observe any of the near points (C, k)."""
     order = np.argsort(obs_point, kind="stable")
     start = np.searchsorted(obs_point[order], np.arange(int(obs_point.max()) + 2))

@@ -53,6 +53,7 @@ from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import minimise
 from pipelines.adjust.terms import ControlPoints, Distances, Fixes
+from pipelines.adjust.tied import cautions_of_common, outliers_in_common, start_at_common
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InconsistencyError, InputError
 from pipelines.core.products import NOT_CHECKED, Remark, save_json, union
 from pipelines.core.sentences import listed
@@ -149,6 +150,9 @@ def _summary(estimated: Estimated, *, is_local: bool) -> Summary:
     ]
     position = float(np.linalg.norm(sigma[4:]))
     figure = f"σ of the georeference alone {position:.3f} m; residuals {', '.join(parts)}"
+    earlier = estimated.posterior.solution.earlier
+    if earlier is not None:
+        figure += f"; tied to {Path(earlier.workspace).name} by {earlier.used} of {earlier.points} points in common"
     if is_local:
         figure = f"local metric frame, σ of its scale {100 * sigma[0]:.2g} %"
     values: dict[str, Any] = {
@@ -160,6 +164,7 @@ def _summary(estimated: Estimated, *, is_local: bool) -> Summary:
         "attitude_used": initial.attitude_used,
         "condition_number": initial.condition_number,
         "inliers": initial.inliers,
+        "earlier": None if earlier is None else earlier.model_dump(),
         "gnss_outliers": list(initial.gnss_outliers),
         "variance_factors": [factor.model_dump() for factor in initial.variance_factors],
         "residuals": {kind: stats.model_dump() for kind, stats in initial.residuals.items()},
@@ -201,7 +206,11 @@ def robust_similarity(
         options = options.model_copy(update={"estimate": (*options.estimate, "lever-arm")})
         of_arm = (arm_caution(pattern),)
     try:
-        starts = (*_levelled_start(survey, model, data, aligned), *_starts(data, aligned, options.seed))
+        starts = (
+            *start_at_common(meets, model, aligned),
+            *_levelled_start(survey, model, data, aligned),
+            *_starts(data, aligned, options.seed),
+        )
         joint = adjust_jointly(meets, model, starts, estimate=options.estimate)
     except DegenerateGeometryError as error:
         inconsistencies = unadjustable(meets, model, alignment.geo_from_local, pattern)
@@ -215,7 +224,8 @@ def robust_similarity(
     of_lens += rolling_shutter_of(survey, model, joint.geo_from_local.scale, motion)
     _refuse(inconsistencies, options)
     initial, more = _joint_product(model, points, aligned, joint)
-    cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, of_lens, limits)
+    of_earlier = cautions_of_common(survey, joint)
+    cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, of_lens, limits, of_earlier)
     told = {caution.code for caution in cautions}
     initial = initial.model_copy(update={"cautions": cautions})
     posterior = solved(survey, model, initial, options.estimate, joint)
@@ -404,6 +414,8 @@ def _joint_product(
             "distance_outliers": tuple(name for name, good in zip(names, used, strict=True) if not good),
             "residuals": residuals,
             "variance_factors": tuple(joint.factors.values()),
+            "tied": joint.problem.earlier is not None,
+            "common_outliers": outliers_in_common(joint),
         }
     ), tuple(warnings)
 

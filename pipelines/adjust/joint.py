@@ -22,7 +22,7 @@ from pipelines.adjust.measurements import onto_control, problem_of, recorded_rot
 from pipelines.adjust.options import EstimatedErrorName
 from pipelines.adjust.state import State
 from pipelines.adjust.system import Linearised, NormalMatrix, Problem, linearised, minimise, posterior_weights
-from pipelines.adjust.terms import CommonErrors, ControlPoints, Distances, Fixes
+from pipelines.adjust.terms import CommonErrors, ControlPoints, Distances, EarlierPoints, Fixes
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import log_so3
@@ -46,7 +46,9 @@ _ROUNDS, _SETTLED = 8, 0.02  # of the factors, and their relative change at whic
 _NEAR = 0.5  # relative change up to which the equations before it serve the first steps
 # Level of the test below which a σ is rejected: a stated one, and one that nobody stated.
 _LEVEL: dict[SigmaSource, float] = {"stated": 0.001, "default": 0.01}
-_TESTED: tuple[Group, ...] = ("fixes", "horizontal drift", "vertical drift", "control points")
+_TESTED: tuple[Group, ...] = ("fixes", "horizontal drift", "vertical drift", "control points", "common points")
+# Nobody states their σ.
+_NEVER_STATED: tuple[Group, ...] = ("horizontal drift", "vertical drift", "common points")
 # Axes of the drift, and the group whose σ holds the mean of the drift.
 _DRIFTS: dict[Group, tuple[list[int], Group]] = {
     "horizontal drift": ([0, 1], "horizontal common error"),
@@ -95,7 +97,7 @@ class JointAdjustment:
     def residuals(self, kind: str) -> tuple[tuple[str, ...], FloatArray, BoolArray]:
         """Return names, residuals (M, d) in metres, measured minus predicted, and the mask (M,) of the inliers."""
         term = self.problem.term(kind)
-        if not isinstance(term, (Fixes, ControlPoints, Distances)):
+        if not isinstance(term, (Fixes, ControlPoints, Distances, EarlierPoints)):
             return (), np.empty((0, 3)), np.empty(0, dtype=bool)
         return term.name, -term.residuals(self.problem.at(self.state)), self.components[kind].used
 
@@ -262,7 +264,7 @@ def _stated_common_errors(survey: Survey, applied: dict[Group, float]) -> dict[G
 
 
 def _source(survey: Survey, group: Group) -> SigmaSource:
-    return "default" if group in survey.default_sigmas or group in _DRIFTS else "stated"
+    return "default" if group in survey.default_sigmas or group in _NEVER_STATED else "stated"
 
 
 def _factor(survey: Survey, group: Group, component: VarianceComponent, applied: float) -> VarianceFactor:

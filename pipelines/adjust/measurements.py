@@ -24,6 +24,7 @@ from pipelines.adjust.terms import (
     Attitudes,
     ControlPoints,
     Distances,
+    EarlierPoints,
     Fixes,
     Level,
     LocalFrame,
@@ -33,13 +34,17 @@ from pipelines.adjust.terms import (
 )
 from pipelines.core.errors import InputError
 from pipelines.core.sentences import listed
-from pipelines.core.types import BoolArray, FloatArray, IntArray, Vector3, vector3
+from pipelines.core.types import BoolArray, FloatArray, IntArray, Vector3, rows_of, vector3
+from pipelines.geodesy.enu import Origin
+from pipelines.geometry.cameras import bearings
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.common_points import CommonPoints
 from pipelines.survey.marks import MarkRays, RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
+from pipelines.survey.trained_model import EarlierDate
 
 _INCONSISTENT_SIGMAS = 6.0
 _INCONSISTENT_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic
@@ -241,6 +246,9 @@ def problem_of(
                 field="--estimate",
             )
     blocks = [] if fixes is None else _common_errors(survey, fixes, with_datum=control is not None)
+    earlier = earlier_of(scene, survey)
+    if survey.common is not None and earlier is not None:
+        blocks.append(SystematicError("earlier-date", _sigma_of_earlier(survey.common)))
     if "lever-arm" in wanted:
         blocks.append(SystematicError("lever-arm", (SIGMA_ARM_M,) * 3))
     if attitudes is not None:
@@ -256,10 +264,15 @@ def problem_of(
         frame = LocalFrame.fixed(float(np.linalg.norm(center - center.mean(axis=0), axis=1).max()))
     has_drift = any(block.name == "drift" for block in blocks)
     level = level_term(scene, survey) if has_drift and attitudes is None else None
-    every: tuple[Term | None, ...] = (fixes, control, distances_of(scene, survey), attitudes, planes, frame, level)
+    distances = distances_of(scene, survey)
+    every: tuple[Term | None, ...] = (fixes, control, earlier, distances, attitudes, planes, frame, level)
     measured = tuple(term for term in every if term is not None)
     datum = survey.sigma_datum_m if control is not None else _datum_of_fixes(survey, fixes)
-    return Problem(scene.poses, scene.bundle, measured, SystematicErrors(tuple(blocks)), sigma_datum_m=datum)
+    date = None
+    if survey.common is not None and earlier is not None:  # The places are those of the earlier date.
+        datum, date = (0.0, 0.0, 0.0), _earlier_date(survey.common, survey.origin_on_earth, len(earlier))
+    errors = SystematicErrors(tuple(blocks))
+    return Problem(scene.poses, scene.bundle, measured, errors, sigma_datum_m=datum, earlier=date)
 
 
 def rejected_of(scene: Scene, survey: Survey, initial: InitialSimilarity) -> Problem | None:
@@ -328,6 +341,63 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
         position_in_geo=position,
         root_information=root_information(of_survey + _mark_covariance(scene, rays, position)),
     )
+
+
+def earlier_of(scene: Scene, survey: Survey) -> EarlierPoints | None:
+    """Return the points in common with an earlier date that two or more registered images see; None: there is none.
+
+    Their marks are the observations of the tracks. With the points eliminated, the information of the bundle is
+    independent of where the observations put these points: nothing is counted twice.
+    """
+    common, sparse = survey.common, scene.sparse
+    if common is None:
+        return None
+    _, here, there = np.intersect1d(sparse.point_id, common.point_id, return_indices=True)
+    row_of = np.full(len(sparse.point_id), -1)
+    row_of[here] = there
+    seen = np.flatnonzero(row_of[sparse.obs_point] >= 0)
+    # An image may observe a point more than once; the first time counts.
+    pairs = np.column_stack([sparse.obs_point[seen], sparse.obs_image[seen]])
+    seen = seen[np.unique(pairs, axis=0, return_index=True)[1]]
+    rays = _rays_of_tracks(scene, seen)
+    rays = rays.of_points(rays.marks_of_point >= 2)
+    if not rays.point_name:
+        return None
+    index = row_of[np.searchsorted(sparse.point_id, np.array(rays.point_name, dtype=np.int64))]
+    position = common.position_in_geo(survey.origin_on_earth)[index]
+    own = _mark_covariance(scene, rays, position) * float(common.factor)
+    return EarlierPoints(
+        name=rays.point_name,
+        **_of_rays(scene, rays),
+        position_in_geo=position,
+        root_information=root_information(common.cov_in_geo(survey.origin_on_earth)[index] + own),
+    )
+
+
+def _rays_of_tracks(scene: Scene, seen: IntArray) -> MarkRays:
+    """Return observations (K,) of the SfM model as marks of points that are named by COLMAP's ids."""
+    sparse = scene.sparse
+    points, point = np.unique(sparse.obs_point[seen], return_inverse=True)
+    camera, xy_px = sparse.obs_image[seen], sparse.obs_xy_px[seen]
+    bearing = np.zeros((len(seen), 3))
+    for image in np.unique(camera):
+        bearing[camera == image] = bearings(sparse.camera_of(int(image)), xy_px[camera == image])
+    sigma_px = np.full(len(seen), scene.bundle.sigma_px)
+    names = tuple(str(sparse.point_id[row]) for row in points)
+    rays = MarkRays(names, point, camera, xy_px, bearing, sigma_px, sigma_px / sparse.focal_px[camera])
+    return rows_of(rays, np.asarray(np.isfinite(bearing).all(axis=1)))
+
+
+def _earlier_date(common: CommonPoints, origin: Origin, used: int) -> EarlierDate:
+    cov, pivot = common.similarity_in_geo(origin)
+    rows = tuple(map(tuple, cov.tolist()))
+    return EarlierDate(
+        workspace=common.earlier, points=int(common.found), used=used, covariance=rows, pivot=vector3(pivot)
+    )
+
+
+def _sigma_of_earlier(common: CommonPoints) -> Vector3:
+    return vector3(np.maximum(common.sigma_m, _LEAST_SIGMA_COMMON_M))
 
 
 def _of_rays(scene: Scene, rays: MarkRays) -> dict[str, Any]:
@@ -401,6 +471,8 @@ def onto_control(problem: Problem, state: State) -> State:
     residual, errors = fixes.residuals(problem.at(state)), state.errors.copy()
     for session in np.unique(fixes.session):
         columns = problem.errors.columns("bias", int(session))
+        if columns is None:  # Without a common error of its own, the fixes show that of an earlier date.
+            columns = problem.errors.columns("earlier-date")
         if columns is not None:
             errors[columns] -= np.median(residual[fixes.session == session], axis=0)
     return replace(state, errors=errors)

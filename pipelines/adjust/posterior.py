@@ -25,11 +25,11 @@ from pipelines.geometry.network import (
     linearise_bundle,
     with_positive_depths,
 )
-from pipelines.geometry.similarity import jacobian_at, second_moment_at
+from pipelines.geometry.similarity import covariance_at, jacobian_at, moved_pivot, second_moment_at
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.marks import MarkRays
 from pipelines.survey.scene import network_of
-from pipelines.survey.trained_model import Adjustment
+from pipelines.survey.trained_model import Adjustment, EarlierDate
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,18 @@ def intersection_jacobian(
 
 
 @dataclass(frozen=True)
+class CommonRows:
+    """Points in common with an earlier date, as the matrix of the adjustment has them: W A of J points.
+
+    W (3 J, 3 J) is their information, robust weights included, and A their derivatives in metres of `geo`.
+    """
+
+    point_id: IntArray  # (J,) COLMAP's
+    by_poses: csr_matrix  # (3 J, 6 n)
+    by_border: FloatArray  # (3 J, b)
+
+
+@dataclass(frozen=True)
 class Posterior:
     """Covariances of a solved survey."""
 
@@ -80,6 +92,7 @@ class Posterior:
     lens: IntArray  # (ℓ,) lens parameters among the unknowns, of L in the order of `geometry.cameras.Lenses`
     camera_cov: FloatArray  # (n, 6, 6) of (δθ [rad], δc [m]) of the cameras, along the axes of `geo`
     grid: AccuracyGrid | None = None  # σ over the scene; None: the scene has too few points
+    common: CommonRows | None = None  # of a survey that is tied to an earlier date
 
     @property
     def datum(self) -> FloatArray:
@@ -100,7 +113,7 @@ class Posterior:
         """
         rays = rows_of(rays, np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
         own = self._intersected(np.nan_to_num(point_in_geo), rays.point, rays.camera, rays.sigma_px)
-        return own + self.datum_against_points
+        return own + self.datum_against_points + self._of_earlier_each(point_in_geo)
 
     def jointly_of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
         """Return the joint covariance (3 J, 3 J) in m² of points (J, 3) that are all determined by their marks.
@@ -110,6 +123,7 @@ class Posterior:
         jacobian = self._jacobian(point_in_geo, rays.point, rays.camera, rays.sigma_px)
         joint = self.normal.covariance(*self._derivatives(jacobian)) + self._second_order(point_in_geo)
         joint = joint + np.tile(self.datum_against_points, (len(point_in_geo), len(point_in_geo)))
+        joint = joint + self._of_earlier(point_in_geo)
         return np.asarray(joint + block_diag(*self._cov_of_marks(jacobian)))
 
     def of_distances(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
@@ -123,6 +137,8 @@ class Posterior:
         slope = block_diag(*np.concatenate([along, -along], axis=2))
         by_poses, by_border = self._derivatives(jacobian)
         across = self.normal.covariances(csr_matrix(slope @ by_poses), slope @ by_border, 1)[:, 0, 0]
+        earlier = self._of_earlier(point_in_geo)
+        across = across + np.diag(slope @ earlier @ slope.T)
         of_marks = self._cov_of_marks(jacobian).reshape(-1, 2, 3, 3).sum(axis=1)
         return np.asarray(across + (along @ of_marks @ np.swapaxes(along, 1, 2))[:, 0, 0])
 
@@ -132,13 +148,15 @@ class Posterior:
         Each of K rays sees one point from one camera: `point` and `camera` (K,) are indices.
         """
         jacobian = self._jacobian(point_in_geo, point, camera)
-        return self.normal.covariances(*self._derivatives(jacobian), 3) + self.datum
+        cov = self.normal.covariances(*self._derivatives(jacobian), 3) + self.datum
+        return cov + self._of_earlier_each(point_in_geo)
 
     def jointly_of_scene(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the joint covariance (3 J, 3 J) in m² of points of the scene; arguments as of `of_scene`."""
         jacobian = self._jacobian(point_in_geo, point, camera)
         joint = self.normal.covariance(*self._derivatives(jacobian)) + self._second_order(point_in_geo)
-        return joint + np.tile(self.datum, (len(point_in_geo), len(point_in_geo)))
+        joint = joint + np.tile(self.datum, (len(point_in_geo), len(point_in_geo)))
+        return joint + self._of_earlier(point_in_geo)
 
     def of_tie_points(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         """Return the covariance (J, 3, 3) in m² of tie points, errors of their own image observations included.
@@ -146,7 +164,22 @@ class Posterior:
         NaN for a point that fewer than two rays see; arguments as of `of_scene`.
         """
         sigma_px = np.full(len(point), np.nan if self.solution.sigma_px is None else self.solution.sigma_px)
-        return self._intersected(point_in_geo, point, camera, sigma_px) + self.datum
+        own = self._intersected(point_in_geo, point, camera, sigma_px) + self.datum
+        return own + self._of_earlier_each(point_in_geo)
+
+    def derivatives(
+        self, point_in_geo: FloatArray, point: IntArray, camera: IntArray, *, of_tracks: bool = False
+    ) -> tuple[csr_matrix, FloatArray, FloatArray]:
+        """Return the derivatives (3 J, 6 n), (3 J, b) of points (J, 3) in geo by the unknowns, and a covariance.
+
+        The covariance (J, 3, 3) is that of the marks, which are image observations of the solution `of_tracks`.
+        Arguments as of `of_scene`.
+        """
+        sigma_px = None
+        if of_tracks and self.solution.sigma_px is not None:
+            sigma_px = np.full(len(point), self.solution.sigma_px)
+        jacobian = self._jacobian(point_in_geo, point, camera, sigma_px)
+        return *self._derivatives(jacobian), self._cov_of_marks(jacobian)
 
     def of_lens(self) -> FloatArray | None:
         """Return the covariance (L, L) of the lens parameters, in the order of `geometry.cameras.Lenses`.
@@ -181,7 +214,23 @@ class Posterior:
         by_model = to_pivot @ turn
         covariance = np.asarray(by_model @ in_model @ by_model.T)
         covariance[4:, 4:] += self.datum
+        date = self.solution.earlier
+        if date is not None:
+            covariance = covariance + moved_pivot(date.covariance, date.pivot, self.solution.geo_from_model.pivot)
         return covariance
+
+    def _of_earlier(self, point_in_geo: FloatArray) -> FloatArray:
+        """Return the joint covariance (3 J, 3 J) that points (J, 3) take over from an earlier date."""
+        date = self.solution.earlier
+        if date is None:
+            return np.zeros((3 * len(point_in_geo),) * 2)
+        by_similarity = jacobian_at(point_in_geo, date.pivot).reshape(-1, 7)
+        return np.asarray(by_similarity @ np.array(date.covariance) @ by_similarity.T)
+
+    def _of_earlier_each(self, point_in_geo: FloatArray) -> FloatArray:
+        """Return the covariance (J, 3, 3) that each of points (J, 3) takes over, or (3, 3) of zeros."""
+        date = self.solution.earlier
+        return np.zeros((3, 3)) if date is None else covariance_at(point_in_geo, date.covariance, date.pivot)
 
     def _intersected(
         self, point_in_geo: FloatArray, point: IntArray, camera: IntArray, sigma_px: FloatArray
@@ -241,7 +290,18 @@ def camera_covariances(normal: NormalMatrix, turn: FloatArray, scale: float) -> 
     return normal.of_each_camera(np.arange(count), by_pose, np.zeros((count, 6, len(normal.corner))))
 
 
+def of_earlier_cameras(date: EarlierDate | None, center_in_geo: FloatArray) -> FloatArray:
+    """Return the covariance (n, 6, 6) of (δθ, δc) that cameras take over with the places of an earlier date."""
+    by_similarity = np.zeros((len(center_in_geo), 6, 7))
+    if date is None:
+        return np.zeros((len(center_in_geo), 6, 6))
+    by_similarity[:, :3, 1:4] = np.eye(3)
+    by_similarity[:, 3:] = jacobian_at(center_in_geo, date.pivot)
+    return np.asarray(by_similarity @ np.array(date.covariance) @ np.swapaxes(by_similarity, 1, 2))
+
+
 _ARRAYS = ("data", "indices", "indptr", "border", "corner", "position", "followed", "lens", "camera_cov")
+_COMMON = ("common_id", "common_data", "common_indices", "common_indptr", "common_border")
 
 
 def save_posterior(posterior: Posterior, path: Path) -> None:
@@ -251,7 +311,12 @@ def save_posterior(posterior: Posterior, path: Path) -> None:
     of_matrix = (poses.data, poses.indices, poses.indptr, normal.border, normal.corner, normal.position)
     arrays = (*of_matrix, posterior.followed, posterior.lens, posterior.camera_cov)
     of_grid = dict(AccuracyGrid.NO_ARRAYS if grid is None else grid.arrays())
-    save_npz(path, dict(zip(_ARRAYS, arrays, strict=True)) | of_grid)
+    common, of_common = posterior.common, {}
+    if common is not None:
+        rows = common.by_poses
+        values = (common.point_id, rows.data, rows.indices, rows.indptr, common.by_border)
+        of_common = dict(zip(_COMMON, values, strict=True))
+    save_npz(path, dict(zip(_ARRAYS, arrays, strict=True)) | of_grid | of_common)
 
 
 def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Posterior:
@@ -260,7 +325,8 @@ def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Poster
     Raises:
         InputError: the file is damaged, or of another solution.
     """
-    arrays, n = read_npz(path, (*_ARRAYS, *AccuracyGrid.NO_ARRAYS)), len(solution.cameras)
+    of_common = _COMMON if solution.earlier is not None else ()
+    arrays, n = read_npz(path, (*_ARRAYS, *AccuracyGrid.NO_ARRAYS, *of_common)), len(solution.cameras)
     border, corner, position, followed, lens, camera_cov = (arrays[name] for name in _ARRAYS[3:])
     known, width = len(followed[0]) - 6 * n if followed.ndim == 2 else -1, len(corner)
     fits = (
@@ -275,6 +341,8 @@ def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Poster
         and arrays["data"].shape == (len(arrays["indices"]), 6, 6)
         and arrays["indptr"].shape == (n + 1,)
     )
+    rows = 3 * len(arrays["common_id"]) if of_common else 0
+    fits = fits and (not of_common or arrays["common_border"].shape == (rows, width))
     if not fits:
         raise InputError(
             "posterior-of-another-solution",
@@ -283,4 +351,9 @@ def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Poster
         )
     poses = bsr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=(6 * n, 6 * n))
     normal, sparse = NormalMatrix(poses, border, corner, position), solution.with_lenses(sfm)
-    return Posterior(solution, sparse, normal, followed, lens, camera_cov, AccuracyGrid.of_arrays(arrays))
+    common = None
+    if of_common:
+        by_poses = csr_matrix(tuple(arrays[name] for name in _COMMON[1:4]), shape=(rows, 6 * n))
+        common = CommonRows(arrays["common_id"], by_poses, arrays["common_border"])
+    grid = AccuracyGrid.of_arrays(arrays)
+    return Posterior(solution, sparse, normal, followed, lens, camera_cov, grid, common)

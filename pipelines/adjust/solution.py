@@ -5,12 +5,13 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from scipy.sparse import block_diag, csr_matrix
 
 from pipelines.adjust.accuracy_grid import accuracy_grid
-from pipelines.adjust.posterior import Posterior, camera_covariances, load_posterior
+from pipelines.adjust.posterior import CommonRows, Posterior, camera_covariances, load_posterior, of_earlier_cameras
 from pipelines.adjust.state import State
 from pipelines.adjust.system import Linearised, NormalMatrix, Problem, linearised, posterior_weights, robust_weights
-from pipelines.adjust.terms import At, Attitudes, ControlPoints, Distances, Fixes
+from pipelines.adjust.terms import At, Attitudes, ControlPoints, Distances, EarlierPoints, Fixes
 from pipelines.core.products import union
 from pipelines.core.stages import SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.workspace import Workspace
@@ -20,7 +21,13 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.report import AccuracySummary
 from pipelines.survey.scene import Scene
-from pipelines.survey.trained_model import Adjustment, Measurement, TrainedCamera, TrainedLens, TrainedModel
+from pipelines.survey.trained_model import (
+    Adjustment,
+    Measurement,
+    TrainedCamera,
+    TrainedLens,
+    TrainedModel,
+)
 
 Named = Fixes | ControlPoints | Distances | Attitudes
 _OPEN = 1e-9  # redundancy below which the other observations leave a direction open
@@ -58,18 +65,32 @@ def adjusted(
         measurements=tuple(_measurements(near, normal, rejected)),
         sigma_px=problem.bundle.sigma_px,
         sigma_datum_m=problem.sigma_datum_m,
+        earlier=problem.earlier,
         variance_factors=initial.variance_factors,
         cautions=union(initial.cautions),
     )
     of_cameras = camera_covariances(normal, similarity.rotation, similarity.scale)
     of_cameras[:, 3:, 3:] += np.diag(np.square(problem.sigma_datum_m))
+    of_cameras += of_earlier_cameras(solution.earlier, similarity.apply(poses.cam_center_in_model))
     lens, moved = problem.lens, solution.with_lenses(sparse)
-    posterior = Posterior(solution, moved, normal, problem.bundle.followed, lens, of_cameras)
+    common = _common_rows(near, normal)
+    posterior = Posterior(solution, moved, normal, problem.bundle.followed, lens, of_cameras, common=common)
     record = similarity.to_record("model", "geo", covariance=posterior.of_similarity, pivot=pivot)
     grid = accuracy_grid(sparse, similarity.apply(scene.point_in_model), posterior.of_scene)
     summary = AccuracySummary(cells=0, reason="the scene has too few points") if grid is None else grid.summary()
     solution = solution.model_copy(update={"geo_from_model": record, "accuracy": summary})
     return replace(posterior, solution=solution, grid=grid)
+
+
+def _common_rows(near: Linearised, normal: NormalMatrix) -> CommonRows | None:
+    """Return the points in common with an earlier date as the normal matrix has them; None: there are none."""
+    term = near.problem.term(EarlierPoints.kind)
+    if not isinstance(term, EarlierPoints):
+        return None
+    rows, weight = near.rows[term.kind], posterior_weights(near.residuals)[term.kind]
+    weigh = csr_matrix(block_diag(list(weight[:, None, None] * np.swapaxes(term.root_information, 1, 2))))
+    by_border = np.pad(weigh @ rows.by_border, ((0, 0), (0, len(normal.corner) - rows.by_border.shape[1])))
+    return CommonRows(np.array(term.name, dtype=np.int64), csr_matrix(weigh @ rows.by_poses), by_border)
 
 
 def posterior_of(workspace: Workspace, solution: Adjustment, sfm: SparseModel) -> Posterior:

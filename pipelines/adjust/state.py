@@ -17,7 +17,7 @@ SIGMA_BORESIGHT_RAD = np.radians(5.0)
 # A component counts as observed if its σ is at most this part of the prior's.
 _OBSERVED_PART = 0.5
 
-ErrorName = Literal["bias", "drift", "lever-arm", "boresight", "common", "lidar-shift"]
+ErrorName = Literal["bias", "drift", "lever-arm", "boresight", "common", "lidar-shift", "earlier-date"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class SystematicError:
     - common: rotation vector that all recorded attitudes share, axes of geo (compass, tilt of a gimbal). Its prior
       has the σ of one attitude: hundreds of attitudes have no more information on the rotation than one.
     - lidar-shift: LiDAR minus its true place, axes of geo.
+    - earlier-date: true place minus that in the solution of the earlier date, which the later one takes over.
     """
 
     name: ErrorName

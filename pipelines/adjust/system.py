@@ -34,6 +34,7 @@ from pipelines.geometry.rotations import skew
 from pipelines.geometry.similarity import perturbation
 from pipelines.geometry.sparse_cholesky import SparseCholesky
 from pipelines.robust.statistics import NOISE_WEIGHT, cauchy_loss, cauchy_weight
+from pipelines.survey.trained_model import EarlierDate
 
 _ROUNDS = 150
 _STILL = 5e-6  # change of a whitened residual that ends the descent
@@ -64,6 +65,7 @@ class Problem:
     lens_frozen: bool = False
     # σ east, north, up in m of an error that all positions share, and that no measurement reveals
     sigma_datum_m: Vector3 = (0.0, 0.0, 0.0)
+    earlier: EarlierDate | None = None  # whose places this survey takes over, with their error
 
     @cached_property
     def terms(self) -> tuple[Term, ...]:

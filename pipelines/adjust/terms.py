@@ -88,13 +88,18 @@ class Fixes(Term):
     drift: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def shares(self, errors: SystematicErrors) -> FloatArray:
-        """Return how far each fix has each systematic error (F, B): its session's bias, and shapes of its drift."""
+        """Return how far each fix has each systematic error (F, B).
+
+        Its session's bias, shapes of its drift, and the place of the earlier date.
+        """
         shares = np.zeros((len(self), len(errors.blocks)))
         for column, block in enumerate(errors.blocks):
             if block.name == "bias":
                 shares[:, column] = self.session == block.session
             elif block.name == "drift" and block.mode is not None:
                 shares[:, column] = np.where(self.session == block.session, self.drift[:, block.mode], 0.0)
+            elif block.name == "earlier-date":
+                shares[:, column] = 1.0
         return shares
 
     def residuals(self, at: At) -> FloatArray:
@@ -198,7 +203,41 @@ class ControlPoints(MarkedTerm):
     root_information: FloatArray  # (J, 3, 3) of survey and intersection together, in 1/m
 
     def residuals(self, at: At) -> FloatArray:
-        """Return S(x_j) − X_j (J, 3) in metres, with x_j the intersection of the marks of point j."""
+        """Return S(x_j) + v − X_j (J, 3) in metres, with x_j the intersection of the marks of point j.
+
+        v is the error of the earlier date, if the survey is tied to one.
+        """
+        return self._missed(self.places(at), at)
+
+    def slopes(self, at: At) -> Slopes:
+        place, by_pose, by_lens_of_mark = self.place_slopes(at)
+        by_lens = np.zeros((len(self), 3, len(at.lens)))
+        np.add.at(by_lens, self.point, by_lens_of_mark)
+        by_errors = np.zeros((len(self), 3, len(at.vector)))
+        if (columns := at.errors.columns("earlier-date")) is not None:
+            by_errors[:, :, columns] = np.eye(3)
+        return Slopes(self._missed(place, at), self.point, self.camera, by_pose, by_lens, by_errors)
+
+    def _missed(self, place: FloatArray, at: At) -> FloatArray:
+        shift = at.errors.value(at.vector, "earlier-date")
+        return place - self.position_in_geo + (0.0 if shift is None else shift)
+
+
+@dataclass(frozen=True)
+class EarlierPoints(MarkedTerm):
+    """Points in common with an earlier date, against their places in its solution.
+
+    The cameras of the earlier date stay as they were solved, as do the files made from them: the later date is
+    adjusted onto them. What of their error the difference of both dates contains is a matter of `adjust.relative`.
+    """
+
+    kind: ClassVar[str] = "common points"
+
+    position_in_geo: FloatArray  # (J, 3) metres, by the earlier solution
+    root_information: FloatArray  # (J, 3, 3) of the marks of both dates together, in 1/m
+
+    def residuals(self, at: At) -> FloatArray:
+        """Return S(x_j) − X_j (J, 3) in metres, with x_j the intersection of the track of point j."""
         return self.places(at) - self.position_in_geo
 
     def slopes(self, at: At) -> Slopes:

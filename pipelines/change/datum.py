@@ -4,6 +4,9 @@ With C₁ and C₂ the covariances of a point by both adjustments, that of the d
 both share, by axis and as a translation: the surveyed coordinates of common control points, on request the base.
 Each adjustment takes of an error the share w of its source in the datum: w_c = V_f / (V_f + V_c) of the control
 points, V_c and V_f being the variances of the mean control point and of the mean fix, and 1 − w_c of the fixes.
+
+Where points in common tie both adjustments (`georef sfm --earlier`), the covariance of the difference is theirs
+(`change.tied`): the place on Earth is one error, which both share.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid
+from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.products import Remark, is_checked
 from pipelines.core.types import FloatArray
@@ -34,6 +38,7 @@ class Epoch:
     grid: AccuracyGrid | None
     reason: str
     cautions: tuple[Remark, ...]
+    posterior: Posterior
 
     def geo_from_plan(self, crs: PointCrs, plan: FloatArray) -> FloatArray:
         """Return places (N, 3) in this survey's `geo` of places (N, 2) in a CRS, at the height of its origin."""
@@ -51,11 +56,11 @@ class Epoch:
 def load_epoch(workspace: Workspace) -> Epoch:
     """Return an epoch of a workspace; errors as of `load_cameras` and `posterior_of`."""
     solved = load_cameras(workspace)
+    posterior = posterior_of(workspace, solved.model, solved.sfm)
     if not is_checked(solved.model.cautions):
-        return Epoch(solved.survey, None, "nothing checks the σ of the positions", solved.model.cautions)
-    grid = posterior_of(workspace, solved.model, solved.sfm).grid
-    reason = "" if grid is not None else "the scene has too few points"
-    return Epoch(solved.survey, grid, reason, solved.model.cautions)
+        return Epoch(solved.survey, None, "nothing checks the σ of the positions", solved.model.cautions, posterior)
+    reason = "" if posterior.grid is not None else "the scene has too few points"
+    return Epoch(solved.survey, posterior.grid, reason, solved.model.cautions, posterior)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 from pipelines.change.datum import Epoch, Shared
 from pipelines.change.detection import LAGS, STEEPEST, Cells, Samples
+from pipelines.change.tied import Tied
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import load_json
 from pipelines.core.progress import Progress
@@ -95,6 +96,7 @@ class CommonGrid:
     Args:
         rasters, epochs: the earlier, then the later.
         inside: polygon in the CRS outside which nothing counts; None: everything does.
+        tied: the points in common that tie both; None: nothing does.
 
     Raises:
         InputError: the rasters have different CRS or datums of heights, or do not overlap.
@@ -106,8 +108,10 @@ class CommonGrid:
         epochs: tuple[Epoch, Epoch],
         shared: Shared,
         inside: Any = None,
+        tied: Tied | None = None,
     ) -> None:
         self.rasters, self.epochs, self._shared, self._inside = rasters, epochs, shared, inside
+        self._tied = tied
         self.frame = _common_frame(*rasters)
         self.crs: PointCrs = parse_crs(rasters[1].sidecar.crs_wkt)
         self.unit_m = self.crs.horizontal_unit
@@ -132,6 +136,8 @@ class CommonGrid:
     def datum_variances(self, plan: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the variances (N, 3) east, north, up in m² of both datums and of their difference, at (N, 2)."""
         before, after = (epoch.variance_at(self.crs, plan) for epoch in self.epochs)
+        if self._tied is not None:
+            return before, after, self._tied.variance_at(self.crs, plan)
         return before, after, self._shared.of_difference(before, after)
 
     @property

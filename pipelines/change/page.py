@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipelines import __version__
 from pipelines.change.grid import WINDOW_PX, CommonGrid
 from pipelines.change.renders import render_pair
+from pipelines.change.tied import Tied
 from pipelines.core.products import Remark
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray, FloatArray
@@ -59,6 +60,7 @@ class Compared:
     polygons: list[Any]
     grid: CommonGrid
     workspaces: tuple[Workspace, Workspace]
+    tied: Tied | None = None
 
     @property
     def names(self) -> tuple[str, str]:
@@ -99,7 +101,10 @@ class Outline:
 
 @dataclass(frozen=True)
 class MapFacts:
-    """Map of the change with outlines over it; `bar_px` is the scale bar's length, that stands for `bar_m`."""
+    """Map of the change with outlines over it; `bar_px` is the scale bar's length, that stands for `bar_m`.
+
+    `points` are the points in common, (x, y) in pixels, and whether each agrees with the others.
+    """
 
     picture: Picture
     outlines: tuple[Outline, ...]
@@ -107,6 +112,7 @@ class MapFacts:
     limit_m: float
     bar_px: float
     bar_m: float
+    points: tuple[tuple[float, float, bool], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -197,7 +203,19 @@ def map_facts(compared: Compared) -> MapFacts:
         for index in compared.largest[:_MOST_NUMBERS]
     )
     bar_m = nice_number(_BAR_SHARE * frame.columns * cell_m)
-    return MapFacts(picture_of(pixels), outlines, scale_colours(), limit_m, bar_m / cell_m, bar_m)
+    points = common_on_map(compared, frame)
+    return MapFacts(picture_of(pixels), outlines, scale_colours(), limit_m, bar_m / cell_m, bar_m, points)
+
+
+def common_on_map(compared: Compared, frame: RasterFrame) -> tuple[tuple[float, float, bool], ...]:
+    """Return the points in common (x, y) in pixels of a picture over a frame, and whether each is used."""
+    if compared.tied is None:
+        return ()
+    plan = compared.grid.crs.xyz_from_lla(compared.tied.lla())[:, :2]
+    x, y = (plan[:, 0] - frame.west) / frame.step_x, (frame.north - plan[:, 1]) / frame.step_y
+    inside = (x >= 0) & (x <= frame.columns) & (y >= 0) & (y <= frame.rows)
+    used = compared.tied.used
+    return tuple(zip(x[inside].tolist(), y[inside].tolist(), used[inside].tolist(), strict=True))
 
 
 def _outline(name: str, polygon: Any, frame: RasterFrame) -> Outline:

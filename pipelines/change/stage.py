@@ -28,6 +28,7 @@ from pipelines.change.grid import CommonGrid, EpochRasters, Window, epoch_raster
 from pipelines.change.options import ChangeOptions
 from pipelines.change.page import Compared, change_page
 from pipelines.change.regions import Parts, find_regions, reach_of
+from pipelines.change.tied import Tied, tied_by
 from pipelines.core.errors import InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, save_json, union
@@ -70,13 +71,14 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     if options.along_normals:
         require_clouds(workspaces)
     registered = options.stable is not None or options.stable_auto
+    tied, solved_again = tied_by(epochs, workspaces)
     for one, workspace in zip(epochs, workspaces, strict=True):
-        if one.grid is None and not registered:
+        if one.grid is None and not registered and tied is None:
             message = f"has no σ of its datum: {one.reason}. Register with --stable FILE or --stable-auto."
             raise InputError("datum-not-known", message, path=workspace.root)
     shared = shared_by(epochs[0].survey, epochs[1].survey, same_base=options.same_base)
     area = _polygons(options.boundary, "--boundary", after, options)
-    grid = CommonGrid((before, after), epochs, shared, None if area is None else shapely.union_all(area))
+    grid = CommonGrid((before, after), epochs, shared, None if area is None else shapely.union_all(area), tied)
     stable = _polygons(options.stable, "--stable", after, options)
     ground = None if stable is None else shapely.union_all(stable)
     noise = unchanged_ground(
@@ -106,14 +108,17 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
         found=found.every,
         regions=found.regions,
         along_normals=moved,
+        common=None if tied is None else tied.common,
     )
     save_json(change, stage.out / "change.json")
     _write_vectors(stage.out, change, found.polygons, grid)
+    if tied is not None:
+        _write_common(stage.out, tied)
     remove(parts.folder)
     cautions = tuple(one.cautions for one in epochs)
     stale = tuple(remark for one in workspaces for remark in _stale_rasters(one))
-    summary = _summary(change, stale, union(*cautions))
-    compared = Compared(stage.out, change, found.polygons, grid, workspaces)
+    summary = _summary(change, (*stale, *solved_again), union(*cautions))
+    compared = Compared(stage.out, change, found.polygons, grid, workspaces, tied)
     page = change_page(compared, summary.warnings, cautions, stage.progress)
     replace_text(stage.out / Path(CHANGE_PAGE).name, render_page(page, _ROOM))
     return summary
@@ -155,12 +160,15 @@ def _summary(change: Change, warnings: tuple[Remark, ...], cautions: tuple[Remar
     if registration.contradicts:
         sentence = (
             f"Unchanged ground lies {registration.shift_m[2]:+.3f} m apart in the epochs, more than the datum's σ "
-            f"of {registration.datum_sigma_v_m:.3f} m explains. Register with --stable FILE or --stable-auto."
+            f"of {registration.datum_sigma_v_m:.3f} m explains. Register with --stable FILE or --stable-auto"
+            f"{'' if change.common is not None else ', or tie the later epoch to the earlier (sfm --earlier)'}."
         )
         warnings = (*warnings, Remark(code="epochs-shifted", sentence=sentence))
     figure = f"{len(found)} regions, {cut:.1f} m³ cut, {fill:.1f} m³ fill, "
     figure += f"shift {registration.shift_m[2]:+.3f} ± {registration.sigma_shift_m[2]:.3f} m "
     figure += "applied" if registration.applied else "seen on unchanged ground, not applied"
+    if change.common is not None:
+        figure += f", {change.common.used} points in common, σ of the difference {change.common.sigma_v_m:.3f} m"
     values = {
         "regions": len(found),
         "cut_m3": cut,
@@ -171,6 +179,7 @@ def _summary(change: Change, warnings: tuple[Remark, ...], cautions: tuple[Remar
         "datum_sigma_v_m": registration.datum_sigma_v_m,
         "long_range_sigma_m": registration.long_range_sigma_m,
         "correlated_m2": registration.correlated_m2,
+        "common": None if change.common is None else change.common.model_dump(),
         "significant_share": change.significant_share,
     }
     return Summary(figure, values, warnings, cautions)
@@ -256,6 +265,19 @@ def _write_significant(folder: Path, parts: Parts, sign: NDArray[np.int8]) -> No
 def _write_mosaic(folder: Path, parts: Parts, name: str) -> None:
     places = [(parts.path(name, window), window.column, window.row) for window in parts.grid.windows()]
     write_mosaic(folder / f"{name}.tif", places, parts.grid.frame, _KINDS[name], {})
+
+
+def _write_common(folder: Path, tied: Tied) -> None:
+    """Write the points in common with their later minus earlier place."""
+    rows = zip(tied.lla(), tied.used.tolist(), np.round(tied.missed_m, 4).tolist(), strict=True)
+    features = [
+        feature(
+            {"type": "Point", "coordinates": np.round(lla[[1, 0]], 8).tolist()},
+            {"used": used, "east_m": missed[0], "north_m": missed[1], "up_m": missed[2]},
+        )
+        for lla, used, missed in rows
+    ]
+    replace_text(folder / "common_points.geojson", features_text(features))
 
 
 def _write_vectors(folder: Path, change: Change, polygons: list[Any], grid: CommonGrid) -> None:

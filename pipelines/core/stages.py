@@ -19,6 +19,7 @@ SURVEY = "ingest/survey.json"
 MASKS = "ingest/masks"  # of the photographs that have one
 TRACK = "ingest/track.npz"  # only for surveys with a trajectory
 SPARSE = "sfm/sparse"
+COMMON_POINTS = "sfm/sparse/common_points.npz"  # only of a survey that is tied to an earlier one
 RIG = "calibrate/rig.json"
 POINTS = "geolocate/points.npz"
 SIM3 = "sim3/geo_from_local.json"

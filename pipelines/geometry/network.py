@@ -94,6 +94,21 @@ def has_positive_depth(network: Network) -> BoolArray:
     return np.asarray(np.einsum("mj,mj->m", network.cam_from_world[network.obs_image, 2], network.rays()) > 0)
 
 
+def points_of_network(network: Network, rows: IntArray) -> Network:
+    """Return the network of some points (P,), which are different ones, each with its whole track."""
+    place = np.full(len(network.point_in_world), -1)
+    place[rows] = np.arange(len(rows))
+    kept = np.flatnonzero(place[network.obs_point] >= 0)
+    kept = kept[np.argsort(place[network.obs_point[kept]], kind="stable")]
+    return replace(
+        network,
+        point_in_world=network.point_in_world[rows],
+        obs_point=place[network.obs_point[kept]],
+        obs_image=network.obs_image[kept],
+        obs_xy_px=network.obs_xy_px[kept],
+    )
+
+
 def projection_residuals(network: Network) -> FloatArray:
     """Return the residuals (M, 2) in pixels, projected minus observed; NaN for a point behind its camera."""
     in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], network.rays())

@@ -102,6 +102,7 @@ _PANELS: dict[str, dict[str, str]] = {
     "geographic terms": {
         "absolute": "fixes",
         "control": "control points",
+        "earlier": "points in common with the earlier date",
         "attitude": "attitudes",
         "relative": "distances",
         "cameras": "corrections of the cameras",

@@ -56,10 +56,13 @@ def rename_images(colmap: Any, path: Path, names: dict[str, str]) -> None:
                 database.update_image(image)
 
 
-def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterable[int] | None = None) -> None:
+def copy_rows(
+    source: Path, target: Path, tables: Iterable[str], images: Iterable[int] | None = None, *, shift: int = 0
+) -> None:
     """Copy rows of features or matches from a finished database of a survey into another; present rows stay.
 
-    `tables` are `FEATURES` or `MATCHES`, `images` indices of those whose features are copied; None: all rows.
+    `tables` are `FEATURES` or `MATCHES`, `images` indices of those whose features are copied; None: all rows. The
+    images of features get numbers that are larger by `shift`.
 
     Raises:
         DamagedPartialError: the source is no whole database, or one of another version of COLMAP.
@@ -78,7 +81,10 @@ def copy_rows(source: Path, target: Path, tables: Iterable[str], images: Iterabl
                 connection.execute("create temp table wanted (image_id integer primary key)")
                 connection.executemany("insert into wanted values (?)", ((index + 1,) for index in images))
             for table in tables:
-                connection.execute(f"insert or ignore into main.{table} select * from source.{table} {wanted}")
+                columns = [row[1] for row in connection.execute(f"pragma source.table_info({table})")]
+                values = [f"{name} + {shift}" if name == "image_id" else name for name in columns]
+                chosen = f"select {', '.join(values)} from source.{table} {wanted}"
+                connection.execute(f"insert or ignore into main.{table} ({', '.join(columns)}) {chosen}")
             connection.execute("commit")
         except sqlite3.DatabaseError as error:
             if storage_error(error) is not None:
@@ -131,6 +137,15 @@ def has_added_features(colmap: Any, path: Path) -> bool:
     """Return whether a photograph of a database has features that `add_features` has added."""
     with colmap.Database.open(path) as database:
         return bool(database.num_keypoints() > database.num_descriptors())
+
+
+def drop_added_features(path: Path) -> None:
+    """Drop from a database what `add_features` has added to the keypoints: features without SIFT's descriptors."""
+    with closing(sqlite3.connect(path)) as connection, connection:
+        known = "(select rows from descriptors where descriptors.image_id = keypoints.image_id)"
+        connection.execute(
+            f"update keypoints set data = substr(data, 1, 4 * cols * {known}), rows = {known} where rows > {known}"
+        )
 
 
 def verified_matches(colmap: Any, path: Path) -> dict[tuple[int, int], int]:

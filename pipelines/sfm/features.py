@@ -23,7 +23,7 @@ from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import Survey, SurveyImage
 
 # Between views that differ by a larger angle SIFT finds hardly any matches.
-_MAX_ANGLE_DEG = 60.0
+MAX_ANGLE_DEG = 60.0
 _SECTORS = 8
 _CANDIDATES_PER_NEIGHBOR = 8  # nearest images from which the neighbours are chosen
 
@@ -50,14 +50,14 @@ def select_pairs(position: FloatArray, axis: FloatArray, max_neighbors: int) -> 
         reach = min(len(located), max_neighbors * _CANDIDATES_PER_NEIGHBOR + 1)
         for i in map(int, located):
             near = located[tree.query(position[i], k=reach)[1]]
-            looks_away = axis[near] @ axis[i] < np.cos(np.radians(_MAX_ANGLE_DEG))  # unknown (NaN) passes
+            looks_away = axis[near] @ axis[i] < np.cos(np.radians(MAX_ANGLE_DEG))  # unknown (NaN) passes
             near = near[(near != i) & ~looks_away]
-            for j in _spread(position[near] - position[i], max_neighbors):
+            for j in spread_of(position[near] - position[i], max_neighbors):
                 chosen.add((min(i, int(near[j])), max(i, int(near[j]))))
     return np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2)
 
 
-def _spread(offset: FloatArray, limit: int) -> list[int]:
+def spread_of(offset: FloatArray, limit: int) -> list[int]:
     """Return up to `limit` candidates, sorted by distance: the nearest half, then the nearest of each sector."""
     order = list(range(min(len(offset), limit // 2)))
     sector = (np.arctan2(offset[:, 1], offset[:, 0]) // (2 * np.pi / _SECTORS)).astype(int)
@@ -144,7 +144,7 @@ def extract_features(colmap: Any, job: SfmJob, images: Sequence[int], progress: 
             if masked and job.masks is not None:
                 reader.mask_path = job.masks
             options.sift.first_octave = -1 if job.options.doubles(size[camera_id]) else 0
-            for step in _steps(of_kind, _IMAGES_PER_STEP):
+            for step in steps(of_kind, _IMAGES_PER_STEP):
                 for image in step:
                     path = job.images / image.name
                     require_unchanged(read_bytes(path), image.sha256, path)
@@ -165,7 +165,7 @@ def match_features(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress
 
     def match(listing: Path) -> None:
         pairing.match_list_path = listing
-        colmap.match_image_pairs(job.database, matching, pairing, _verification(colmap, job))
+        colmap.match_image_pairs(job.database, matching, pairing, verification(colmap, job))
 
     _by_pairs(colmap, job, pairs, match, progress.task("matching", len(pairs)))
 
@@ -174,12 +174,12 @@ def verify_matches(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress
     """Verify the matches of pairs (P, 2) that are in the database."""
 
     def verify(listing: Path) -> None:
-        colmap.verify_matches(job.database, listing, _verification(colmap, job))
+        colmap.verify_matches(job.database, listing, verification(colmap, job))
 
     _by_pairs(colmap, job, pairs, verify, progress.task("verification", len(pairs)))
 
 
-def _verification(colmap: Any, job: SfmJob) -> Any:
+def verification(colmap: Any, job: SfmJob) -> Any:
     options = colmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job.options.seed
     options.ransac.max_num_trials = _MOST_TRIALS
@@ -202,7 +202,7 @@ def _by_pairs(
     rename_images(colmap, job.database, {name: _number(index) for index, name in enumerate(names)})
     try:
         with shown as task:
-            for step in _steps(pairs, _PAIRS_PER_STEP):
+            for step in steps(pairs, _PAIRS_PER_STEP):
                 lines = (f"{_number(a)} {_number(b)}\n" for a, b in step)
                 listing.write_text("".join(lines), encoding="utf-8")
                 work(listing)
@@ -222,6 +222,6 @@ def _number(index: int) -> str:
     return f"{index:06d}"
 
 
-def _steps(items: Any, size: int) -> Iterator[Any]:
+def steps(items: Any, size: int) -> Iterator[Any]:
     for begin in range(0, len(items), size):
         yield items[begin : begin + size]

@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from pipelines.core.options import EFFORT, InputMarker, StageOptions
+from pipelines.core.stages import ADJUSTMENT, MODEL, SPARSE
 
 _DOUBLED_BELOW_PX = 1000
 _SOLVED = frozenset({".bin", ".txt", ".json", ".geojson", ".opf", ".gltf", ".xml", ".csv"})
@@ -14,6 +15,8 @@ _BESIDE = (
     (".json", ("tracks.csv",)),
     (".geojson", ("cameras.json", "../cameras.json")),
 )
+# What this date takes from an earlier one: a new solution there asks for new ties.
+_SOLUTION = frozenset({SPARSE, ADJUSTMENT, MODEL})
 SolvedCamerasPath = Annotated[Path, InputMarker(_SOLVED, beside=_BESIDE)]
 
 
@@ -49,6 +52,11 @@ class SfmOptions(StageOptions):
         "(.opf), Metashape's cameras (XML), OpenSfM's or ODM's reconstruction.json, ODM's shots.geojson, "
         "nerfstudio's transforms.json, or RealityScan's CSV. Points are triangulated where the file has none.",
         json_schema_extra={"flag": "--import"},
+    )
+    earlier: Annotated[Path, InputMarker(only=_SOLUTION)] | None = Field(
+        None,
+        description="Workspace of an earlier date, solved: tie this one to it by points in common, so that "
+        "`georef change` needs no registration. It is only read.",
     )
     triangulate: bool = Field(
         False,

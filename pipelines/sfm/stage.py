@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.core.child import run_in_child
-from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError
+from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError, InputError
 from pipelines.core.plan import photograph_folder
 from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import Progress
-from pipelines.core.stages import SURVEY
+from pipelines.core.stages import COMMON_POINTS, SURVEY
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import quiet_colmap
+from pipelines.sfm.dates import EarlierDate, tie_to_earlier
 from pipelines.sfm.features import SfmJob, masks_beside
 from pipelines.sfm.learned_weights import learned_remedy
 from pipelines.sfm.options import SfmOptions
@@ -38,6 +39,12 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
     """
     path = stage.workspace.path(SURVEY)
     survey, engine = load_json(Survey, path), reconstructor_of(options)
+    if options.earlier is not None:  # What cannot be tied is refused before the work begins.
+        if options.earlier.resolve() == stage.workspace.root.resolve():
+            raise InputError(
+                "earlier-is-itself", "is this workspace itself.", field="--earlier", path=options.earlier
+            )
+        EarlierDate.load(options.earlier, survey)
     continues = engine.prepare(stage, survey, options)
     arguments = {
         "survey": str(path),
@@ -72,6 +79,14 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
     model = reconstructor_of(options).reconstruct(job, progress)
     summary = _summarise(model, survey)
     warnings = list(summary.warnings)
+    if options.earlier is not None:
+        if not database.is_file():
+            message = "needs the features of the photographs, which an imported model with points has none of."
+            raise InputError("earlier-needs-features", message, field="--earlier")
+        with quiet_colmap() as colmap:
+            common = tie_to_earlier(colmap, job, model, EarlierDate.load(options.earlier, survey), progress)
+        common.save(job.sparse / Path(COMMON_POINTS).name)
+        summary.values["common_points"] = len(common)
     if database.is_file():
         with quiet_colmap() as colmap:
             warnings += unregistered(colmap, database, model, learned_remedy(options.features))

@@ -31,6 +31,8 @@ class InitialSimilarity(Product):
         condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.
         layout: extent of the correspondences: they fill a volume, lie in a plane, or on a line.
         variance_factors: tests of the stated σ, with the factors that apply to all later stages.
+        tied: whether points in common with an earlier date take part.
+        common_outliers: COLMAP's ids of those that were rejected.
     """
 
     format_version: Literal[1] = 1
@@ -46,6 +48,8 @@ class InitialSimilarity(Product):
     layout: Literal["volume", "plane", "line"]
     attitude_used: bool
     variance_factors: tuple[VarianceFactor, ...] = ()
+    tied: bool = False
+    common_outliers: tuple[int, ...] = ()
     cautions: tuple[Remark, ...] = ()
 
     def weighted(self, survey: Survey) -> Survey:
@@ -73,7 +77,12 @@ class InitialSimilarity(Product):
             for distance in survey.distances
             if distance.use == "check" or (distance.name not in bad_distances) == used
         )
-        return survey.model_copy(update={"images": images, "control_points": control, "distances": distances})
+        common = None
+        if used and self.tied and survey.common is not None:
+            common = survey.common.without(self.common_outliers)
+        return survey.model_copy(
+            update={"images": images, "control_points": control, "distances": distances, "common": common}
+        )
 
 
 @dataclass(frozen=True)

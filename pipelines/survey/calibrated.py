@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import ArrayProduct, Remark, load_json, union
-from pipelines.core.stages import RIG, SURVEY, TRACK
+from pipelines.core.stages import COMMON_POINTS, RIG, SURVEY, TRACK
 from pipelines.core.types import BoolArray, FloatArray, Matrix3, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.trajectory import Rig, Trajectory, with_rig
+from pipelines.survey.common_points import CommonPoints
 from pipelines.survey.survey import Attitude, Fix, FixLag, RigCalibration, RigParameter, Survey, SurveyImage
 
 log = logging.getLogger(__name__)
@@ -142,11 +143,15 @@ ValueT = TypeVar("ValueT")
 def load_survey(workspace: Workspace) -> Survey:
     """Return the survey of a workspace, with the calibration of the rig in its positions and attitudes.
 
+    It has the points in common with an earlier date, if `sfm` has found any.
+
     Raises:
         MissingProductError: the survey does not exist.
         InputError: a product is damaged, or the calibration has no navigation to be applied to.
     """
     survey = load_json(Survey, workspace.path(SURVEY))
+    if workspace.has(COMMON_POINTS):
+        survey = survey.model_copy(update={"common": CommonPoints.load(workspace.path(COMMON_POINTS))})
     try:
         calibration = load_json(RigCalibration, workspace.path(RIG))
     except MissingProductError:

@@ -35,6 +35,25 @@ class Registration(Product):
     contradicts: bool
 
 
+class CommonDates(Product):
+    """Points in common that tie two epochs, one of which was adjusted onto the other, or both onto others.
+
+    Attributes:
+        steps: from one epoch to the other, by way of the epochs that they were adjusted onto.
+        points, used: number of the points of the step with the fewest, and of those that agree with the others.
+        spread: share of the ground in common that has points, least of the steps.
+        sigma_h_m, sigma_v_m: σ of the difference of both epochs, horizontal along an axis and vertical, in the
+            median over the scene. It has no part of the place on Earth, which both share.
+    """
+
+    steps: int
+    points: int
+    used: int
+    spread: float
+    sigma_h_m: float
+    sigma_v_m: float
+
+
 class ChangedRegion(Product):
     """Region by its name: R, found; P, of the user's polygons; with the σ of its net volume."""
 
@@ -75,6 +94,7 @@ class Change(Product):
         significant_share: of all cells.
         lowered, raised, found: sums of the found regions that lost, that gained, and of all.
         along_normals: of the clouds, on request.
+        common: what ties both epochs; None: they were solved apart.
     """
 
     format_version: Literal[2] = 2
@@ -91,3 +111,4 @@ class Change(Product):
     found: ChangedRegion
     regions: tuple[ChangedRegion, ...]
     along_normals: AlongNormals | None = None
+    common: CommonDates | None = None

@@ -182,6 +182,7 @@ Group = Literal[
     "marks",
     "attitudes",
     "tie points",
+    "common points",
 ]
 SigmaSource = Literal["stated", "default"]
 
@@ -229,6 +230,7 @@ def with_variance_factors(survey: Survey, applied: dict[Group, float], *, of_ass
         update={
             "images": tuple(_image(image, applied) for image in survey.images),
             "sessions": tuple(_session(session, applied) for session in survey.sessions),
+            "common": None if survey.common is None else survey.common.scaled(applied.get("common points", 1.0)),
             "control_points": tuple(
                 _point(point, applied.get("control points", 1.0), of_marks) for point in survey.control_points
             ),
@@ -285,10 +287,11 @@ class EstimatedError(Product):
         name: `bias`: fix minus truth, east, north, up, in m. `lever-arm`: antenna seen from the camera beyond the
             arm that the survey has applied, camera axes, in m. `boresight`: rotation vector from the true to the
             nominal camera axes, in degrees. `lidar-shift`: LiDAR minus its true place, east, north, up, in m.
+            `earlier-date`: truth minus the places of the earlier date, east, north, up, in m.
         observed: σ is at most half of that of the prior.
     """
 
-    name: Literal["bias", "lever-arm", "boresight", "lidar-shift"]
+    name: Literal["bias", "lever-arm", "boresight", "lidar-shift", "earlier-date"]
     session: int | None = None
     unit: Literal["m", "deg"]
     value: Vector3

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from pipelines.core.errors import InputError
 from pipelines.core.options import WRITTEN, from_text, listed_names
@@ -21,6 +21,7 @@ from pipelines.core.validators import image_dir
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.cameras import Camera
+from pipelines.survey.common_points import CommonPoints
 
 LOCAL_FRAME = "local-frame"  # code of the caution that a survey has no place on Earth
 RigParameter = Literal["time-offset", "boresight", "lever-arm"]
@@ -357,7 +358,10 @@ class Survey(Product):
         cautions: limits of every result of the survey.
         estimate: parameters of the rig to be estimated after sfm.
         default_sigmas: groups of measurements whose σ nobody stated.
+        common: points in common with an earlier date, which `sfm` finds; no part of the file.
     """
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
 
     format_version: Literal[2] = 2
     origin: Origin | None
@@ -378,6 +382,7 @@ class Survey(Product):
     cautions: tuple[Remark, ...] = ()
     estimate: tuple[RigParameter, ...] = ()
     default_sigmas: tuple[Literal["fixes", "control points", "marks", "attitudes"], ...] = ()
+    common: CommonPoints | None = Field(None, exclude=True)
 
     @model_validator(mode="before")
     @classmethod

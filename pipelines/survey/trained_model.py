@@ -1,14 +1,14 @@
 """Solution of a survey: frames, cameras, lenses, systematic errors; with the settings of `train`, its product."""
 
 from dataclasses import replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
 from pipelines.core.products import Covariance3, ImageName, Product, Remark, Rotation, load_json
 from pipelines.core.stages import ADJUSTMENT, MODEL
-from pipelines.core.types import Matrix34, Vector3
+from pipelines.core.types import Matrix34, Row7, Vector3
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
@@ -64,6 +64,23 @@ class Measurement(Product):
     left_out_cov_m2: Covariance3 | None = None
 
 
+class EarlierDate(Product):
+    """Earlier date that a solution is tied to, whose places it has taken over.
+
+    Attributes:
+        workspace: its folder.
+        points, used: points in common with it, and those that take part, as they agree with the others.
+        covariance, pivot: of its similarity, as in `SimilarityRecord`, in this `geo`: the error of place, rotation
+            and scale that both dates share. All absolute covariances include it.
+    """
+
+    workspace: str
+    points: int
+    used: int
+    covariance: Annotated[tuple[Row7, ...], Field(min_length=7, max_length=7)]
+    pivot: Vector3
+
+
 class Adjustment(Product):
     """Solution of all that does not depend on Gaussians: similarity, cameras, lenses, systematic errors.
 
@@ -76,6 +93,7 @@ class Adjustment(Product):
         sigma_px: σ of an image coordinate of a tie point.
         sigma_datum_m: σ east, north, up that all positions share beyond the matrix of the adjustment: that of the
             transformation of the control points' CRS. All absolute covariances include it.
+        earlier: the earlier date that the places are tied to; None: there is none.
         accuracy: predicted σ over the scene; None: a solution that states none.
         variance_factors: tests of the stated σ, of the initial similarity.
         cautions: limits: those of the initial similarity, then the solution's own.
@@ -92,6 +110,7 @@ class Adjustment(Product):
     measurements: tuple[Measurement, ...] = ()
     sigma_px: float | None = None
     sigma_datum_m: Vector3 = (0.0, 0.0, 0.0)
+    earlier: EarlierDate | None = None
     accuracy: AccuracySummary | None = None
     variance_factors: tuple[VarianceFactor, ...] = ()
     cautions: tuple[Remark, ...] = ()

@@ -188,8 +188,8 @@ def _summary(
     if lidar is not None:
         values["lidar"] = lidar.model_dump(mode="json")
     key_figure = f"{model.gaussians} gaussians, train PSNR {psnr:.2f} dB"
-    # A common error of the fixes is everyday: init-sim3 has tested it against its prior, and its cautions tell it.
-    told = [_warning_of(error) for error in model.estimated_errors if error.name != "bias"]
+    # Common errors of the fixes, and of an earlier date, are everyday: init-sim3 has told them by its cautions.
+    told = [_warning_of(error) for error in model.estimated_errors if error.name in _CAUSES]
     warnings = [warning for warning in told if warning is not None]
     if record.recovery is not None:
         warnings.append(Remark(code="training-recovered", sentence=record.recovery))

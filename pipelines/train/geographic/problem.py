@@ -213,6 +213,8 @@ class GeoProblem(torch.nn.Module):
         xy = marks.rays(rows, self.cameras.lens())
         depth, seen = depth_at(depth_m, alpha, xy, pinhole)
         surveyed = marks.position_in_geo[rows]
+        if (columns := self.errors.errors.columns("earlier-date")) is not None:
+            surveyed = surveyed - self.errors.vector()[columns]
         residual = depth_residuals(self.cameras.pose(camera), self.similarity(), surveyed, xy, depth)
         if self.weighting == "whitened":
             residual = (marks.root_information[rows] @ residual[:, :, None])[:, :, 0]

@@ -134,6 +134,21 @@ class ControlTerm(MarkedTensorTerm):
     root_information: Tensor
 
     def residuals(self, at: Estimate) -> Tensor:
+        missed = at.geo_from_model.apply(self._intersected(at)) - self.position_in_geo
+        shift = at.error("earlier-date")
+        return missed if shift is None else missed + shift
+
+
+@dataclass(frozen=True)
+class EarlierTerm(MarkedTensorTerm):
+    """Points in common with an earlier date, `adjust.terms.EarlierPoints`, in float64."""
+
+    kind: ClassVar[str] = "earlier"
+
+    position_in_geo: Tensor
+    root_information: Tensor
+
+    def residuals(self, at: Estimate) -> Tensor:
         return at.geo_from_model.apply(self._intersected(at)) - self.position_in_geo
 
 
@@ -222,6 +237,8 @@ def tensor_term(term: adjustment.Term, errors: SystematicErrors) -> TensorTerm:
             return FixTerm(**_tensors(term, "camera", "position_in_geo", "root_information"), shares=shares)
         case adjustment.ControlPoints():
             return ControlTerm(**_tensors(term, *(field.name for field in fields(ControlTerm))))
+        case adjustment.EarlierPoints():
+            return EarlierTerm(**_tensors(term, *(field.name for field in fields(EarlierTerm))))
         case adjustment.Distances():
             return KnownDistanceTerm(**_tensors(term, *(field.name for field in fields(KnownDistanceTerm))))
         case adjustment.Attitudes():

@@ -1,0 +1,393 @@
+"""Points in common with an earlier date: features matched across the dates, and the tracks of both that they tie.
+
+The earlier workspace is read and never written. Its features come from its database, its cameras and points from
+its solution. A pair of tracks is common if verified matches tie them, and if it fits the similarity that most pairs
+agree on. Ground that has changed has few such pairs, and no part of the ground has more of a say than another.
+"""
+
+import logging
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipelines.adjust.posterior import Posterior
+from pipelines.adjust.relative import Solved
+from pipelines.adjust.solution import posterior_of
+from pipelines.adjust.tied import common_similarity
+from pipelines.core.errors import DamagedPartialError, DegenerateGeometryError, InputError
+from pipelines.core.machine import chosen_threads
+from pipelines.core.products import is_checked
+from pipelines.core.progress import Progress
+from pipelines.core.stages import SPARSE
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.workspace import Workspace
+from pipelines.formats.colmap import flatten, load_reconstruction
+from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, lla_of
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.sfm.colmap_database import FEATURES, copy_rows, drop_added_features, remove_database
+from pipelines.sfm.features import MAX_ANGLE_DEG, SfmJob, spread_of, steps, verification
+from pipelines.survey.common_points import CommonPoints, solution_hash
+from pipelines.survey.survey import Survey
+from pipelines.survey.trained_survey import SolvedSurvey, load_cameras
+
+log = logging.getLogger(__name__)
+
+DATABASE = "sfm/database.db"
+_NEIGHBOURS = 8  # earlier photographs that a later one is matched with
+_EXHAUSTIVE_UP_TO = 400  # pairs across the dates
+_PAIRS_PER_STEP = 48
+_LEAST = 8  # points in common: fewer agree by chance, and check nothing
+_LEAST_MATCHES = 15  # verified ones of a pair, as COLMAP's own mapper asks for
+_BLOCKS = 12  # along the longer side of the ground in common
+_SPREAD_BLOCKS = 6
+_MOST = 600  # points: more say nothing new of some dozen modes of deformation, and cost time in every stage
+_REACH = 3.0  # heights of flight between a photograph and the nearest of the other date
+_FARTHEST_M = 30.0  # between the positions of both dates beyond that reach: consumer receivers err by metres
+
+
+@dataclass(frozen=True)
+class EarlierDate:
+    """Earlier date as it was solved: its survey, SfM model and posterior; read only."""
+
+    workspace: Workspace
+    solved: SolvedSurvey
+    posterior: Posterior
+
+    @classmethod
+    def load(cls, root: Path, later: Survey) -> "EarlierDate":
+        """Read the earlier date of a later survey.
+
+        Raises:
+            MissingProductError: the workspace is not solved; names the command.
+            InputError: a product is damaged; either date has no place on Earth; the earlier one has no features; or
+                the two lie apart.
+        """
+        workspace = Workspace(root)
+        solved = load_cameras(workspace)
+        if solved.survey.origin is None or later.origin is None:
+            which = "The earlier" if solved.survey.origin is None else "This"
+            message = (
+                f"{which} survey has a local metric frame and no place on Earth, which two dates need to share."
+            )
+            raise InputError("not-on-earth", message, path=root, field="--earlier")
+        if not workspace.has(DATABASE):
+            message = "has no features (sfm/database.db), as an imported model has none. Solve it from photographs."
+            raise InputError("earlier-without-features", message, path=root, field="--earlier")
+        date = cls(workspace, solved, posterior_of(workspace, solved.model, solved.sfm))
+        date._require_near(later)
+        return date
+
+    @cached_property
+    def center_in_ecef(self) -> FloatArray:
+        """Solved projection centres (n, 3)."""
+        center = self.solved.geo_from_model.apply(self.solved.poses.cam_center_in_model)
+        return ecef_from_enu(center, self.solved.survey.origin_on_earth)
+
+    @cached_property
+    def axis_in_ecef(self) -> FloatArray:
+        """Solved optical axes (n, 3)."""
+        in_geo = self.solved.poses.cam_from_model[:, 2] @ self.solved.geo_from_model.rotation.T
+        return np.asarray(in_geo @ ecef_from_enu_rotation(lla_of(self.solved.survey.origin_on_earth)).T)
+
+    @cached_property
+    def at(self) -> Solved:
+        return Solved(self.posterior, self.solved.survey.origin_on_earth)
+
+    def _require_near(self, later: Survey) -> None:
+        position, _ = _recorded(later)
+        known = np.isfinite(position).all(axis=1)
+        if not known.any():
+            return
+        distance, _ = cKDTree(self.center_in_ecef).query(position[known])
+        rays = np.linalg.norm(self.at.network.rays(), axis=1) * self.solved.geo_from_model.scale
+        reach_m = _REACH * float(np.median(rays)) + _FARTHEST_M
+        if float(distance.min()) > reach_m:
+            message = (
+                f"has nothing in common with this survey: the nearest photographs of both dates are "
+                f"{distance.min():.0f} m apart, and those of the earlier date see {np.median(rays):.0f} m far."
+            )
+            raise InputError("earlier-apart", message, path=self.workspace.root, field="--earlier")
+
+
+def tie_to_earlier(colmap: Any, job: SfmJob, model: Any, earlier: EarlierDate, progress: Progress) -> CommonPoints:
+    """Return the points that a `pycolmap.Reconstruction` has in common with an earlier date.
+
+    Raises:
+        DegenerateGeometryError: too few points are common; says how far the search came.
+        InputError: the features of the earlier date cannot be read.
+    """
+    pairs = pairs_across(job.survey, model, earlier)
+    with _both_dates(colmap, job, model, earlier) as dates:
+        tied = dates.matched(colmap, job, pairs, progress)
+    chosen = tied.agreeing(flatten(model), earlier)
+    if chosen is None or len(chosen.later) < _LEAST:
+        found = 0 if chosen is None else len(chosen.later)
+        message = (
+            f"{len(pairs)} pairs of photographs across the dates have {tied.matches} verified matches, which tie "
+            f"{found} points that agree; {_LEAST} are needed. Nothing on the ground looks the same at both dates, "
+            "or scale, season or light differ too much. Try a larger --max-features, or solve this date alone: "
+            "--forget earlier."
+        )
+        raise DegenerateGeometryError("earlier-not-tied", message)
+    points = _placed(chosen, earlier)
+    log.info(
+        "%d points tie the dates, of %d verified matches in %d pairs; they cover %.0f %% of the ground in common.",
+        len(points), tied.matches, len(pairs), 100 * float(points.spread),
+    )  # fmt: skip
+    return points
+
+
+def pairs_across(survey: Survey, model: Any, earlier: EarlierDate) -> list[tuple[int, int]]:
+    """Return the pairs (later image id, index of an earlier camera) that may show the same place.
+
+    Few pairs are all taken. Otherwise, half of a photograph's partners are the nearest that look in a similar
+    direction, and the others are the nearest in each of eight directions. Without a position it has none.
+    """
+    ids = sorted(model.reg_image_ids())
+    count = len(earlier.center_in_ecef)
+    if len(ids) * count <= _EXHAUSTIVE_UP_TO:
+        return [(image_id, other) for image_id in ids for other in range(count)]
+    position, axis = _recorded(survey)
+    tree, pairs = cKDTree(earlier.center_in_ecef), []
+    turn = ecef_from_enu_rotation(lla_of(survey.origin_on_earth))
+    for image_id in ids:
+        here = position[image_id - 1]
+        if not np.isfinite(here).all():
+            continue
+        near = np.atleast_1d(tree.query(here, k=min(count, _NEIGHBOURS * _NEIGHBOURS))[1])
+        looks_away = earlier.axis_in_ecef[near] @ axis[image_id - 1] < np.cos(np.radians(MAX_ANGLE_DEG))
+        near = near[~looks_away]  # unknown (NaN) passes
+        offset = (earlier.center_in_ecef[near] - here) @ turn
+        pairs += [(image_id, int(near[row])) for row in spread_of(offset, _NEIGHBOURS)]
+    return pairs
+
+
+def _recorded(survey: Survey) -> tuple[FloatArray, FloatArray]:
+    """Return positions and optical axes (n, 3) of the photographs as recorded, Earth-centred; NaN: unknown."""
+    unknown, origin = np.full(3, np.nan), survey.origin_on_earth
+    in_geo = np.array([image.fix.position_in_geo if image.fix else unknown for image in survey.images])
+    axis = np.array(
+        [
+            matrix_from_quat_xyzw(image.attitude.quat_xyzw)[:, 2] if image.attitude else unknown
+            for image in survey.images
+        ]
+    )
+    return ecef_from_enu(in_geo, origin), axis @ ecef_from_enu_rotation(lla_of(origin)).T
+
+
+@dataclass(frozen=True)
+class _Ties:
+    """Pairs of tracks: COLMAP's ids of points in the later and the earlier model, and the pairs of photographs."""
+
+    later: IntArray
+    earlier: IntArray
+    votes: IntArray
+    matches: int  # verified ones, of all features
+    spread: float = 0.0
+
+    def agreeing(self, model: SparseModel, earlier: EarlierDate) -> "_Ties | None":
+        """Return the pairs that agree on a similarity, thinned to an even number in each block; None: none does."""
+        sfm = earlier.solved.sfm
+        row = _rows(model.point_id, self.later)
+        other = _rows(sfm.point_id, self.earlier)
+        known = (row >= 0) & (other >= 0)
+        row, other = row[known], other[known]
+        if len(row) < 3:
+            return None
+        in_geo = earlier.solved.geo_from_model.apply(earlier.solved.point_in_model)
+        try:
+            similarity, near = common_similarity(model.point_in_local[row], in_geo[other], np.random.default_rng(0))
+        except DegenerateGeometryError:
+            return None
+        ties = self._at(np.flatnonzero(known)[near])
+        place, ground = in_geo[other[near]], (in_geo, similarity.apply(model.point_in_local))
+        length = np.bincount(sfm.obs_point, minlength=len(sfm.point_id))[other[near]]
+        length = length + np.bincount(model.obs_point, minlength=len(model.point_id))[row[near]]
+        chosen = _thinned(place, ties.votes * 1000 + length, ground)
+        return replace(ties._at(chosen), spread=_spread(place[chosen], ground))
+
+    def _at(self, rows: IntArray) -> "_Ties":
+        return replace(self, later=self.later[rows], earlier=self.earlier[rows], votes=self.votes[rows])
+
+
+def _rows(ids: IntArray, wanted: IntArray) -> IntArray:
+    """Return the rows of wanted ids in ascending ids; −1: not among them."""
+    place = np.minimum(np.searchsorted(ids, wanted), len(ids) - 1)
+    return np.where(ids[place] == wanted, place, -1)
+
+
+def _blocks(ground: tuple[FloatArray, FloatArray], count: int) -> tuple[FloatArray, float]:
+    """Return the corner (2,) and the side of blocks over the ground that both of two clouds cover."""
+    quantiles = [np.quantile(cloud[:, :2], [0.02, 0.98], axis=0) for cloud in ground]
+    low, high = np.maximum(*(each[0] for each in quantiles)), np.minimum(*(each[1] for each in quantiles))
+    return low, max(float((high - low).max()) / count, 1e-6)
+
+
+def _thinned(place: FloatArray, merit: IntArray, ground: tuple[FloatArray, FloatArray]) -> IntArray:
+    """Return the best rows of each block, so many of each that the sum is at most `_MOST`."""
+    low, side = _blocks(ground, _BLOCKS)
+    _, block = np.unique(np.floor((place[:, :2] - low) / side), axis=0, return_inverse=True)
+    block = block.reshape(-1)
+    order = np.lexsort((-merit, block))
+    rank = np.arange(len(order)) - np.searchsorted(block[order], block[order])
+    each = np.bincount(block)
+    most = max((m for m in range(1, int(each.max()) + 1) if np.minimum(each, m).sum() <= _MOST), default=1)
+    return np.sort(order[rank < most])
+
+
+def _spread(place: FloatArray, ground: tuple[FloatArray, FloatArray]) -> float:
+    """Return the share of the blocks with points of both dates that have points in common."""
+    low, side = _blocks(ground, _SPREAD_BLOCKS)
+
+    def occupied(cloud: FloatArray) -> set[tuple[int, int]]:
+        return {(int(x), int(y)) for x, y in np.floor((cloud[:, :2] - low) / side)}
+
+    both = occupied(ground[0]) & occupied(ground[1])
+    inside = {(x, y) for x, y in both if 0 <= x < _SPREAD_BLOCKS and 0 <= y < _SPREAD_BLOCKS}
+    return len(occupied(place) & inside) / max(len(inside), 1)
+
+
+def _placed(ties: _Ties, earlier: EarlierDate) -> CommonPoints:
+    """Return pairs of tracks with their places by the earlier solution."""
+    position, cov = earlier.at.placed(ties.earlier)
+    known: BoolArray = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
+    similarity, pivot = earlier.at.similarity_in_ecef
+    return CommonPoints(
+        point_id=ties.later[known],
+        earlier_point_id=ties.earlier[known],
+        matches=ties.votes[known],
+        position_in_ecef=position[known],
+        cov_in_ecef=cov[known],
+        sigma_m=earlier.at.sigma_m,
+        cov_similarity=similarity,
+        pivot_in_ecef=pivot,
+        spread=np.asarray(ties.spread),
+        found=np.asarray(int(known.sum())),
+        factor=np.asarray(1.0),
+        checked=np.asarray(is_checked(earlier.solved.model.cautions)),
+        earlier=str(earlier.workspace.root.absolute()),
+        solution=solution_hash(earlier.workspace),
+    )
+
+
+@dataclass(frozen=True)
+class _BothDates:
+    """Database with the features of both dates; the ids of the earlier images follow those of the later."""
+
+    path: Path
+    first: int  # added to COLMAP's ids of the earlier images
+    later: Any  # pycolmap.Reconstruction
+    earlier: Any
+    earlier_ids: IntArray  # of the earlier cameras, in their order
+    known: dict[int, IntArray] = field(default_factory=dict)  # points of the features of images
+
+    def matched(self, colmap: Any, job: SfmJob, pairs: list[tuple[int, int]], progress: Progress) -> _Ties:
+        """Match pairs (later image id, index of an earlier camera), and return the tracks that they tie."""
+        matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
+        matching.num_threads = chosen_threads(job.options.threads)
+        pairing.match_list_path = self.path.with_name("pairs_across.txt")
+        ids = [(a, self.first + int(self.earlier_ids[b])) for a, b in pairs]
+        with progress.task("matching across the dates", len(ids)) as task:
+            for step in steps(ids, _PAIRS_PER_STEP):
+                lines = (f"{a:09d} {b:09d}\n" for a, b in step)
+                pairing.match_list_path.write_text("".join(lines), encoding="utf-8")
+                colmap.match_image_pairs(self.path, matching, pairing, verification(colmap, job))
+                task.advance(len(step))
+        pairing.match_list_path.unlink(missing_ok=True)
+        votes: Counter[tuple[int, int]] = Counter()
+        with colmap.Database.open(self.path) as database:
+            found = [self._tied(database, a, b) for a, b in ids if database.exists_two_view_geometry(a, b)]
+        for of_pair, _ in found:
+            votes.update(of_pair)
+        return _one_to_one(votes, sum(matches for _, matches in found))
+
+    def _tied(self, database: Any, a: int, b: int) -> tuple[set[tuple[int, int]], int]:
+        """Return the pairs of points (later, earlier) that two images tie, and their number of verified matches."""
+        rows = np.asarray(database.read_two_view_geometry(a, b).inlier_matches, dtype=np.int64).reshape(-1, 2)
+        if len(rows) < _LEAST_MATCHES:
+            return set(), len(rows)
+        points = self._points(a), self._points(b)
+        rows = rows[(rows[:, 0] < len(points[0])) & (rows[:, 1] < len(points[1]))]
+        both = np.column_stack([points[0][rows[:, 0]], points[1][rows[:, 1]]])
+        return {(int(one), int(two)) for one, two in both[(both >= 0).all(axis=1)]}, len(rows)
+
+    def _points(self, number: int) -> IntArray:
+        """Return `_points_of` of the image with a number in the database, which many pairs ask for."""
+        if number not in self.known:
+            later = number < self.first
+            image = self.later.images[number] if later else self.earlier.images[number - self.first]
+            self.known[number] = _points_of(image)
+        return self.known[number]
+
+
+def _points_of(image: Any) -> IntArray:
+    """Return the points (K,) of the features of an image of a `pycolmap.Reconstruction`; −1: none."""
+    return np.array([point.point3D_id if point.has_point3D() else -1 for point in image.points2D], dtype=np.int64)
+
+
+def _one_to_one(votes: Counter[tuple[int, int]], matches: int) -> _Ties:
+    """Return the pairs of tracks that each other's votes prefer."""
+    best: tuple[dict[int, tuple[int, int]], dict[int, tuple[int, int]]] = ({}, {})
+    for pair, count in sorted(votes.items()):
+        for side, key in enumerate(pair):
+            if count > best[side].get(key, (0, 0))[0]:
+                best[side][key] = (count, pair[1 - side])
+    kept = [(*pair, count) for pair, count in sorted(votes.items()) if _is_best(pair, best)]
+    table = np.array(kept, dtype=np.int64).reshape(-1, 3)
+    return _Ties(table[:, 0], table[:, 1], table[:, 2], matches)
+
+
+def _is_best(pair: tuple[int, int], best: tuple[dict[int, tuple[int, int]], ...]) -> bool:
+    return best[0][pair[0]][1] == pair[1] and best[1][pair[1]][1] == pair[0]
+
+
+@contextmanager
+def _both_dates(colmap: Any, job: SfmJob, model: Any, earlier: EarlierDate) -> Iterator[_BothDates]:
+    """Make a database of the registered photographs of both dates with their features; it is removed at the end."""
+    path = job.database.with_name("dates.db")
+    other = load_reconstruction(earlier.workspace.path(SPARSE))
+    first = max(model.images) + 1
+    cameras = max(model.cameras) + 1
+    remove_database(path)
+    try:
+        with colmap.Database.open(path) as database, colmap.DatabaseTransaction(database):
+            _write_images(colmap, database, model, 0, 0)
+            _write_images(colmap, database, other, first, cameras)
+        ids = [sorted(one.reg_image_ids()) for one in (model, other)]
+        copy_rows(job.database, path, FEATURES, [image_id - 1 for image_id in ids[0]])
+        try:
+            copy_rows(earlier.workspace.path(DATABASE), path, FEATURES, [i - 1 for i in ids[1]], shift=first)
+        except DamagedPartialError as error:
+            raise InputError("earlier-features", str(error), field="--earlier") from error
+        drop_added_features(path)
+        yield _BothDates(path, first, model, other, earlier.solved.sfm.image_id)
+    finally:
+        remove_database(path)
+
+
+def _write_images(colmap: Any, database: Any, model: Any, first: int, cameras: int) -> None:
+    """Write the solved cameras and the registered images of a model, their ids moved, into a database."""
+    for camera in model.cameras.values():
+        moved = colmap.Camera(
+            model=camera.model_name, width=camera.width, height=camera.height, params=camera.params
+        )
+        moved.camera_id, moved.has_prior_focal_length = cameras + camera.camera_id, True
+        database.write_camera(moved, use_camera_id=True)
+        rig = colmap.Rig(rig_id=moved.camera_id)
+        rig.add_ref_sensor(moved.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+    for image_id in sorted(model.reg_image_ids()):
+        camera_id, number = cameras + model.images[image_id].camera_id, first + image_id
+        row = colmap.Image(name=f"{number:09d}", camera_id=camera_id, image_id=number)
+        database.write_image(row, use_image_id=True)
+        frame = colmap.Frame(frame_id=number, rig_id=camera_id)
+        frame.add_data_id(row.data_id)
+        database.write_frame(frame, use_frame_id=True)

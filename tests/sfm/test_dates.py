@@ -1,0 +1,176 @@
+"""Points in common with an earlier date: from the features of both databases to the tracks that they tie.
+
+The features of a point look the same at both dates, but for noise, unless the ground there has changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.adjust.posterior import save_posterior
+from pipelines.core.errors import DegenerateGeometryError, InputError, MissingProductError
+from pipelines.core.products import save_json
+from pipelines.core.progress import SILENT
+from pipelines.core.stages import ADJUSTMENT, SIM3, SIM3_POSTERIOR
+from pipelines.formats.colmap import quiet_colmap, reconstruction_of
+from pipelines.geodesy.enu import Origin
+from pipelines.sfm.colmap_database import write_frame
+from pipelines.sfm.dates import DATABASE, EarlierDate, pairs_across, tie_to_earlier
+from pipelines.sfm.features import SfmJob
+from pipelines.sfm.options import SfmOptions
+from pipelines.survey.common_points import CommonPoints
+from pipelines.survey.survey import Survey
+from tests.scenes import write_workspace
+from tests.two_dates import ASIDE, HERE, IMAGES, POINTS, Date, draw_date, ground
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+OPTIONS = SfmOptions(threads=1)
+LOOKS = np.random.default_rng(11).integers(0, 60, (POINTS, 128))
+
+
+@pytest.fixture(autouse=True)
+def _coarse_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.adjust.accuracy_grid._CELLS", 6)
+
+
+def write_features(date: Date, path: Path, looks: np.ndarray, seed: int) -> None:
+    """Write a database with a feature for every observation, in the order of the model's."""
+    model, rng = date.model, np.random.default_rng(seed)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with quiet_colmap() as colmap:
+        write_frame(colmap, path, date.survey, range(IMAGES), OPTIONS)
+        with colmap.Database.open(path) as database:
+            for image in range(IMAGES):
+                rows = np.flatnonzero(model.obs_image == image)
+                shape = np.tile([1.0, 0.0, 0.0, 1.0], (len(rows), 1))
+                keypoints = np.column_stack([model.obs_xy_px[rows], shape]).astype(np.float32)
+                database.write_keypoints(image + 1, keypoints)
+                seen = looks[model.obs_point[rows]] + rng.integers(0, 4, (len(rows), 128))
+                data = np.clip(seen, 0, 255).astype(np.uint8)
+                kind = colmap.FeatureExtractorType.SIFT
+                database.write_descriptors(image + 1, colmap.FeatureDescriptors(kind, data))
+
+
+def earlier_workspace(root: Path, origin: Origin = HERE) -> Date:
+    date = draw_date(0, np.random.default_rng(0), origin=origin)
+    workspace = write_workspace(root, date.survey, date.model)
+    save_json(date.estimated.initial, root / SIM3)
+    save_json(date.estimated.posterior.solution, root / ADJUSTMENT)
+    save_posterior(date.estimated.posterior, root / SIM3_POSTERIOR)
+    write_features(date, workspace.root / DATABASE, LOOKS, 1)
+    return date
+
+
+def tied(root: Path, later: Date, looks: np.ndarray = LOOKS) -> CommonPoints:
+    """Tie a later date to the workspace `spring`."""
+    job = SfmJob(later.survey, root, root / "autumn" / DATABASE, OPTIONS)
+    write_features(later, job.database, looks, 2)
+    with quiet_colmap() as colmap:
+        found = tie_to_earlier(
+            colmap, job, reconstruction_of(later.model), EarlierDate.load(root / "spring", later.survey), SILENT
+        )
+    assert sorted(path.name for path in job.database.parent.iterdir()) == ["database.db"]
+    return found
+
+
+@pytest.mark.parametrize("origin", [HERE, ASIDE])
+def test_tracks_that_look_alike_tie_the_dates(tmp_path: Path, origin: Origin) -> None:
+    earlier = earlier_workspace(tmp_path / "spring", origin)
+    before = {path: path.read_bytes() for path in (tmp_path / "spring").rglob("*") if path.is_file()}
+    found = tied(tmp_path, draw_date(1, np.random.default_rng(1)))
+    np.testing.assert_array_equal(found.point_id, found.earlier_point_id)  # ids are those of one ground
+    assert len(found) > 0.8 * POINTS
+    assert float(found.spread) > 0.9
+    assert found.name == "spring"
+    # The earlier date lies where its receiver has put it, and the points with it: to half a pixel of 7 cm.
+    place = earlier.seen(ground()[found.point_id - 1])
+    assert np.sqrt(((place - found.position_in_ecef) ** 2).mean()) < 0.03
+    sigma = np.sqrt(np.trace(found.cov_in_ecef, axis1=1, axis2=2) / 3)
+    assert 0.005 < np.median(sigma) < 0.03
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_changed_ground_ties_nothing(tmp_path: Path) -> None:
+    earlier_workspace(tmp_path / "spring")
+    changed = np.flatnonzero(ground()[:, 0] > 3.0)
+    looks = LOOKS.copy()
+    looks[changed] = np.random.default_rng(12).integers(0, 60, (len(changed), 128))
+    found = tied(tmp_path, draw_date(1, np.random.default_rng(1)), looks)
+    assert not np.isin(found.point_id - 1, changed).any()
+    assert len(found) > 0.7 * (POINTS - len(changed))
+    assert float(found.spread) < 0.85
+
+
+def test_nothing_in_common_is_refused(tmp_path: Path) -> None:
+    earlier_workspace(tmp_path / "spring")
+    looks = np.random.default_rng(12).integers(0, 60, LOOKS.shape)
+    with pytest.raises(DegenerateGeometryError) as refused:
+        tied(tmp_path, draw_date(1, np.random.default_rng(1)), looks)
+    assert refused.value.code == "earlier-not-tied"
+
+
+def test_another_place_is_refused_before_the_work(tmp_path: Path) -> None:
+    earlier_workspace(tmp_path / "spring")
+    later = draw_date(1, np.random.default_rng(1)).survey
+    moved = later.model_copy(update={"origin": Origin(lat_deg=46.03, lon_deg=7.75, alt_m=1600.0)})
+    with pytest.raises(InputError) as refused:
+        EarlierDate.load(tmp_path / "spring", moved)
+    assert refused.value.code == "earlier-apart"
+    assert "3" in str(refused.value)  # three kilometres
+
+
+def without_origin(root: Path, survey: Survey) -> Survey:
+    return survey.model_copy(update={"origin": None})
+
+
+def without_database(root: Path, survey: Survey) -> Survey:
+    (root / DATABASE).unlink()
+    return survey
+
+
+def without_solution(root: Path, survey: Survey) -> Survey:
+    (root / ADJUSTMENT).unlink()
+    return survey
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "code"),
+    [(without_origin, "not-on-earth"), (without_database, "earlier-without-features"), (without_solution, None)],
+)
+def test_what_cannot_be_tied_is_refused(
+    tmp_path: Path, spoiled: Callable[[Path, Survey], Survey], code: str | None
+) -> None:
+    survey = spoiled(tmp_path / "spring", earlier_workspace(tmp_path / "spring").survey)
+    with pytest.raises(InputError if code else MissingProductError) as refused:
+        EarlierDate.load(tmp_path / "spring", survey)
+    if code:
+        assert refused.value.code == code  # type: ignore[union-attr]
+
+
+def test_photographs_of_a_large_survey_are_paired_with_those_beside_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.sfm.dates._EXHAUSTIVE_UP_TO", 0)
+    monkeypatch.setattr("pipelines.sfm.dates._NEIGHBOURS", 2)
+    earlier_workspace(tmp_path / "spring")
+    later = draw_date(1, np.random.default_rng(1))
+    date = EarlierDate.load(tmp_path / "spring", later.survey)
+    model: Any = reconstruction_of(later.model)
+    pairs = pairs_across(later.survey, model, date)
+    assert {image_id for image_id, _ in pairs} == set(range(1, IMAGES + 1))
+    assert len(pairs) <= 2 * IMAGES
+    # Both dates have their cameras on one ring, 30° apart in the mean: the nearest are beside each other.
+    center = later.truth.cam_center_in_world
+    there = draw_date(0, np.random.default_rng(0)).truth.cam_center_in_world
+    away = [np.linalg.norm(center[image_id - 1] - there[other]) for image_id, other in pairs]
+    assert np.median(away) < 35.0
+    unknown = replace(later, survey=later.survey.model_copy(
+        update={"images": tuple(image.model_copy(update={"fix": None}) for image in later.survey.images)}
+    ))  # fmt: skip
+    assert pairs_across(unknown.survey, model, date) == []
