@@ -83,6 +83,8 @@ HOMES: dict[str, tuple[str, ...]] = {
     "plyfile": ("pipelines.formats",),
     "defusedxml": ("pipelines.formats",),
     "rosbags": ("pipelines.formats",),
+    "pye57": ("pipelines.formats.e57",),
+    "OpenEXR": ("pipelines.formats.depth_image",),
     "trimesh": ("pipelines.surface.mesh",),
     "embreex": ("pipelines.simulate.mesh",),
     "matplotlib": ("pipelines.report.plots",),

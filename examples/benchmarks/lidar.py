@@ -1,16 +1,17 @@
-"""Surface of a simulated flight with and without LiDAR: `python examples/benchmarks/lidar.py OUT --help`.
+"""Surface of a simulated flight with and without measured geometry: `lidar.py OUT --help`.
 
     lidar.py OUT --seeds 0,1,2,3,4 --size 1200x900 --train "--preset fast --max-image-size 640"
 
 Of each seed, the survey is simulated and reconstructed once. Trainings in OUT/seedN are then compared with the true
 scene: without LiDAR; with a cloud of 2 cm; with the scanner's track, too; with Gaussians held, or rendered depths,
-instead of both; and with a cloud that shows a building that has been removed since.
+instead of both; and with a cloud that shows a building that has been removed since. `e57` is that cloud as two
+scans with poses, `depth maps` are what a depth camera of 2 cm in the place of each photograph would measure.
 
 Pixels of the test views, and of every fourth training view, are intersected with the true scene. They count if the
 unchanged cloud has a point within 0.3 m of that place. `wall`, `roof` and `ground` are medians of the distance
 between the rendered and the true surface, perpendicular to the latter, in metres; `wall > 1 m` is the share of the
 walls' pixels beyond one metre, which the medians leave out; `check walls` is the median error of check points on
-walls.
+walls. `held-out` is the median of all classes in the test views alone, of which no depth map is used.
 
 The registration is measured on the unchanged cloud: `shift error` is the largest component of what it finds for
 that cloud, and `of 0.1 m` the largest difference between 0.1 m and what is found for it, added along each axis.
@@ -27,6 +28,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -36,6 +38,8 @@ from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import ecef_from_enu, enu_from_ecef
+from pipelines.geometry.cameras import Camera, undistort
+from pipelines.simulate.lidar import LidarFlight
 from pipelines.simulate.mesh import MISS, Material, Raycaster
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import RecordedFlight, fly_survey, write_lidar_flight
@@ -51,6 +55,8 @@ from pipelines.survey.trained_survey import load_trained
 from pipelines.train.adjusted_scene import AdjustedScene
 from pipelines.train.lidar import compared_lidar, lidar_surface, registration_of
 from pipelines.train.options import TrainOptions
+from pipelines.train.stage import measured_files
+from tests.geometry_files import ScanFile, write_e57
 
 CLASSES = {
     "wall": (Material.WALL,),
@@ -65,7 +71,12 @@ TRAININGS: dict[str, tuple[str | None, tuple[str, ...]]] = {
     "lidar, gaussians": ("none", ("--lidar-loss", "gaussians")),
     "lidar, depth": ("none", ("--lidar-loss", "depth")),
     "lidar, removed": ("removed", ()),
+    "e57": ("none", ()),
+    "e57, removed": ("removed", ()),
+    "depth maps": ("none", ("--depth-unit", "0.002", "--depth-along", "axis")),
+    "depth maps, removed": ("removed", ("--depth-unit", "0.002", "--depth-along", "axis")),
 }
+DEPTH_STEP_M = 0.002
 STRIDE, EVERY = 2, 4  # of the pixels, and of the training views
 COVERED_M = 0.3
 NEAR_M = 1.0  # a larger distance is another surface
@@ -111,7 +122,7 @@ def measured(seed: int, name: str, arguments: argparse.Namespace) -> dict[str, A
         subprocess.run(["cp", "-rn", f"{base}/.", str(workspace)], check=True)
         lidar: tuple[Any, ...] = ()
         if change is not None:
-            cloud = cloud_of(flight, given, home, change)
+            cloud = geometry_of(name, flight, given, home, change)
             track = (cloud.with_name("lidar_trajectory.csv"),) if "--lidar-trajectory" in options else ()
             lidar = ("--lidar", cloud, "--lidar-sigma", "0.02", *options, *track)
         georef("train", workspace, *arguments.train.split(), *lidar)
@@ -119,8 +130,57 @@ def measured(seed: int, name: str, arguments: argparse.Namespace) -> dict[str, A
     cloud = cloud_of(flight, given, home, "none")
     row = {"seed": seed, "training": name, **figures(Workspace(workspace), flight, survey, cloud)}
     if change is not None:
-        row |= comparison(Workspace(workspace), flight, cloud, cloud_of(flight, given, home, change))
+        row |= comparison(
+            Workspace(workspace), flight, cloud, geometry_of(name, flight, given, home, change), change != "none"
+        )
     return row
+
+
+def geometry_of(name: str, flight: RecordedFlight, given: dict[str, Any], home: Path, change: str) -> Path:
+    """The measured geometry of a training, written if it is not there yet."""
+    if name.startswith("depth maps"):
+        return depth_maps_of(flight, given, home / f"depths_{change}", change)
+    cloud = cloud_of(flight, given, home, change)
+    return e57_of(cloud, flight) if name.startswith("e57") else cloud
+
+
+def e57_of(cloud: Path, flight: RecordedFlight) -> Path:
+    """The cloud as two scans with poses, in Earth-centred coordinates."""
+    path = cloud.with_suffix(".e57")
+    if not path.exists():
+        chunks = list(CloudReader(cloud, CloudCrs()).chunks(flight.world.origin))
+        points = ecef_from_enu(np.concatenate([chunk.position_in_geo for chunk in chunks]), flight.world.origin)
+        middle, half = points.mean(axis=0).round(), len(points) // 2
+        quat = (np.cos(0.3), 0.0, 0.0, np.sin(0.3))
+        write_e57(
+            path, [ScanFile(points[:half], quat, middle), ScanFile(points[half:], center=middle)], crs="EPSG:4978"
+        )
+    return path
+
+
+def depth_maps_of(flight: RecordedFlight, given: dict[str, Any], folder: Path, change: str) -> Path:
+    """Depth maps of all photographs from their true places, as PNG of 16 bits, with noise of 2 cm along the ray."""
+    if folder.exists():
+        return folder
+    options = SimulateOptions.model_validate({**given, "lidar_change": change})
+    rays = Raycaster(LidarFlight(options, flight.world.scene, flight.lidar_seed).mesh)
+    truth, rng = flight.recording.truth, np.random.default_rng(0)
+    camera = Camera(truth.lens.model, truth.lens.width, truth.lens.height, np.array(truth.lens.params))
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    slope = undistort(camera, np.stack([x, y], axis=-1).reshape(-1, 2))
+    in_cam = np.column_stack([slope, np.ones(len(slope))])
+    length = np.linalg.norm(in_cam, axis=1)
+    draft = folder.with_name(folder.name + ".partial")
+    draft.mkdir(parents=True, exist_ok=True)
+    for name, center, turn in zip(truth.images, truth.centers, truth.cam_from_enu, strict=True):
+        direction = (in_cam / length[:, None]) @ np.array(turn)
+        hits = rays.first_hits(np.array(center), direction)
+        true_m = rays.exact_distance(np.array(center), direction, hits)
+        depth = np.where(hits.triangle == MISS, 0.0, true_m + rng.normal(0, 0.02, len(true_m))) / length
+        counts = np.clip(np.rint(np.nan_to_num(depth) / DEPTH_STEP_M), 0, 65534).astype(np.uint16)
+        cv2.imwrite(str((draft / name).with_suffix(".png")), counts.reshape(camera.height, camera.width))
+    draft.rename(folder)
+    return folder
 
 
 def cloud_of(flight: RecordedFlight, given: dict[str, Any], home: Path, change: str) -> Path:
@@ -140,7 +200,7 @@ def figures(workspace: Workspace, flight: RecordedFlight, survey: Path, cloud: P
     on_wall = {target.name for target in truth.targets if target.surface == "wall"}
     walls = [point for point in on_surface.points if point.name in on_wall and point.de_m is not None]
     errors = [np.linalg.norm([point.de_m or 0.0, point.dn_m or 0.0, point.du_m or 0.0]) for point in walls]
-    distance, material = surface_errors(workspace, flight, cloud)
+    distance, material, is_test = surface_errors(workspace, flight, cloud)
     near = np.abs(distance) < NEAR_M
     by_class = {
         kind: round(float(np.median(np.abs(distance[near & np.isin(material, materials)]))), 4)
@@ -150,12 +210,15 @@ def figures(workspace: Workspace, flight: RecordedFlight, survey: Path, cloud: P
         **by_class,
         "wall bias": round(float(np.median(distance[near & (material == Material.WALL)])), 4),
         "wall > 1 m": round(float(1 - near[material == Material.WALL].mean()), 4),
+        "held-out": round(float(np.median(np.abs(distance[near & is_test]))), 4),
         "check walls": round(float(np.median(errors)), 4) if errors else None,
         "test PSNR": views.psnr,
     }
 
 
-def comparison(workspace: Workspace, flight: RecordedFlight, unchanged: Path, used: Path) -> dict[str, Any]:
+def comparison(
+    workspace: Workspace, flight: RecordedFlight, unchanged: Path, used: Path, changed: bool
+) -> dict[str, Any]:
     """Errors of the registration, and shares of rejected points, by the stage's own functions."""
     manifest = workspace.manifest(BY_NAME["train"])
     assert manifest is not None
@@ -164,16 +227,14 @@ def comparison(workspace: Workspace, flight: RecordedFlight, unchanged: Path, us
     survey, scene = adjusted.survey, adjusted.scene
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     images.build(SILENT)
-    maps, files = (
-        DepthMaps(workspace.cache / "surface", scene, images),
-        CloudReader(used, CloudCrs(options.lidar_crs, options.lidar_vertical)),
-    )
+    maps, files = DepthMaps(workspace.cache / "surface", scene, images), measured_files(options, scene)
+    assert files is not None
     maps.build(SILENT)
     compared = compared_lidar(
         options, files, maps, survey,
         track=None, georeference=adjusted.adjustment.geo_from_model, seed=options.seed, progress=SILENT,
     )  # fmt: skip
-    if used == unchanged:
+    if not changed:
         found = compared.registration.shift_m
         off = []
         for axis in 0.1 * np.eye(3):
@@ -195,14 +256,19 @@ def points_of(cloud: Path, flight: RecordedFlight) -> cKDTree:
     return cKDTree(np.concatenate([chunk.position_in_geo for chunk in chunks]))
 
 
-def surface_errors(workspace: Workspace, flight: RecordedFlight, cloud: Path) -> tuple[FloatArray, np.ndarray]:
-    """Rendered minus true surface where the cloud covers it, along the outward normal (K,), and materials (K,)."""
+def surface_errors(
+    workspace: Workspace, flight: RecordedFlight, cloud: Path
+) -> tuple[FloatArray, np.ndarray, np.ndarray]:
+    """Rendered minus true surface where the cloud covers it, along the outward normal (K,), and materials (K,).
+
+    The last array (K,) says which pixels are of test views.
+    """
     covered, trained = points_of(cloud, flight), load_trained(workspace)
     images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
     renderer = ModelRenderer(trained, images, rasterizer("auto"))
     mesh, origin = flight.world.scene.mesh, flight.world.origin
     rays = Raycaster(mesh)
-    distances, materials = [], []
+    distances, materials, tests = [], [], []
     shown: dict[str, list[int]] = {"test": [], "train": []}
     for index, camera in enumerate(trained.model.cameras):
         shown[camera.split].append(index)
@@ -227,7 +293,8 @@ def surface_errors(workspace: Workspace, flight: RecordedFlight, cloud: Path) ->
         off = (true_m - np.linalg.norm(place - center, axis=1)) * slant
         distances.append(off[found])
         materials.append(np.asarray(mesh.material)[hits.triangle[found]])
-    return np.concatenate(distances), np.concatenate(materials)
+        tests.append(np.full(len(found), index in shown["test"]))
+    return np.concatenate(distances), np.concatenate(materials), np.concatenate(tests)
 
 
 def georef(command: str, workspace: Path, *options: Any) -> None:

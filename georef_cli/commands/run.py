@@ -37,7 +37,11 @@ log = logging.getLogger(__name__)
 # Options of later stages that `run` offers too, with the stages that they are for. All other options are set in
 # georef.toml, or with the stage's own command.
 _EFFORT = ("preset", "iterations", "max_image_size", "max_gaussians", "crop_size", "blocks")
-_LIDAR = ("lidar", "lidar_crs", "lidar_vertical", "lidar_trajectory", "lidar_sigma", "lidar_register")
+_LIDAR = (
+    *("lidar", "lidar_crs", "lidar_vertical", "lidar_offset"),
+    *("lidar_trajectory", "lidar_sigma", "lidar_register"),
+    *("depth_unit", "depth_along", "depth_camera"),
+)
 _IN_AREA = (
     "train",
     "evaluate",

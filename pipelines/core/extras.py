@@ -13,7 +13,7 @@ from urllib.request import url2pathname
 from pipelines.core.errors import BackendUnavailableError
 
 Extra = Literal[
-    "bags", "cluster", "heif", "learned", "mesh", "reference", "simulator", "terrain", "vectors", "viewer"
+    "bags", "cluster", "heif", "learned", "mesh", "reference", "scans", "simulator", "terrain", "vectors", "viewer"
 ]
 # What needs each extra, and the libraries that it installs, by the names of their packages.
 EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
@@ -23,6 +23,7 @@ EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
     "learned": ("learned features (--features learned)", ("kornia",)),
     "mesh": ("georef export-mesh", ("trimesh",)),
     "reference": ("M3C2 (georef evaluate --reference)", ("py4dgeo",)),
+    "scans": ("E57 clouds and EXR depth maps (--lidar, --reference)", ("pye57", "OpenEXR")),
     "simulator": ("georef simulate", ("embreex",)),
     "terrain": ("the ground (dtm.tif, classes of the cloud)", ("cloth-simulation-filter",)),
     "vectors": ("contour lines and boundaries (--contours, --boundary)", ("ezdxf", "pyogrio")),
@@ -38,6 +39,7 @@ SIZES_MB: dict[Extra | Literal["cuda"], int] = {
     "learned": 29,
     "mesh": 4,
     "reference": 150,
+    "scans": 64,
     "simulator": 46,
     "terrain": 6,
     "vectors": 130,

@@ -106,7 +106,8 @@ def notation(value: object) -> str:
     return f"{value:.15g}" if isinstance(value, float) else str(value)
 
 
-def _triple(text: str) -> tuple[float, ...]:
+def triple_of(text: str) -> tuple[float, ...]:
+    """Return the three numbers of a text with commas; a ValueError: it has others."""
     parts = text.split(",")
     if len(parts) != 3:
         raise ValueError(f"{text!r} is not three numbers with commas, such as 46.02,7.75,1620")
@@ -128,9 +129,9 @@ def _on_earth(place: Vector3) -> Vector3:
     return place
 
 
-Triple = Annotated[Vector3, from_text(_triple), AfterValidator(_finite), WRITTEN]
+Triple = Annotated[Vector3, from_text(triple_of), AfterValidator(_finite), WRITTEN]
 # Latitude and longitude in degrees, ellipsoidal height in metres.
-PlaceOnEarth = Annotated[Vector3, from_text(_triple), AfterValidator(_finite), AfterValidator(_on_earth), WRITTEN]
+PlaceOnEarth = Annotated[Vector3, from_text(triple_of), AfterValidator(_finite), AfterValidator(_on_earth), WRITTEN]
 
 OptionsT = TypeVar("OptionsT", bound=StageOptions)
 

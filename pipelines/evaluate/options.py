@@ -7,7 +7,7 @@ from pydantic import Field
 from pipelines.core.options import ExtraMarker, InputPath
 from pipelines.geodesy.vertical import Vertical
 from pipelines.splat.rasterizer.choice import Backend
-from pipelines.survey.options import CloudPath, FilledAreaOptions
+from pipelines.survey.options import CloudPath, FilledAreaOptions, MapOffset
 from pipelines.survey.report_parts import Alignment
 
 
@@ -40,8 +40,13 @@ class EvaluateOptions(FilledAreaOptions):
     )
     reference: Annotated[CloudPath, ExtraMarker("reference")] | None = Field(
         None,
-        description="Compare the surface with this cloud (LAS, LAZ or PLY, or a folder of them), where photographs "
-        "saw it.",
+        description="Compare the surface with this cloud (LAS, LAZ, E57, PLY) or mesh (PLY, OBJ, GLB), or a folder "
+        "of them, where photographs saw it.",
+    )
+    reference_offset: MapOffset | None = Field(
+        None,
+        description="Easting, northing and height that are added to the coordinates of the reference's files, in "
+        "their unit. It overrules what files beside a mesh state.",
     )
     reference_crs: str | None = Field(
         None,

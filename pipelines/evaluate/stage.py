@@ -284,7 +284,9 @@ def _rendered(
     files, progress = None, stage.progress
     if options.reference is not None:  # refused before work starts: a file without a CRS, and a missing library
         require_py4dgeo()
-        stated = CloudCrs(options.reference_crs, options.reference_vertical, "--reference")
+        stated = CloudCrs(
+            options.reference_crs, options.reference_vertical, "--reference", options.reference_offset
+        )
         files = CloudReader(options.reference, stated)
     images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
     images.build(progress)

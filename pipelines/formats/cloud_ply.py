@@ -2,19 +2,21 @@
 
 Coordinates are written as doubles, so that no offset can be lost. CloudCompare reads them and offers a shift for
 its display. Programs that keep float32 coordinates need the LAZ. A PLY has no CRS. PLYs are read in chunks, binary
-and with the vertices first; faces and other elements after these are not read.
+or ASCII, with the vertices first; of meshes, `triangle_mesh.py` reads the faces.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from plyfile import PlyData, PlyElement
 
 from pipelines.core.errors import InputError
+from pipelines.core.files import reading
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, Rows
 from pipelines.formats.splat_ply import PLY_TYPES, ply_header
 from pipelines.geodesy.geotiff_keys import FileCrs
@@ -52,13 +54,18 @@ _COARSEST_M = 5e-4  # largest rounding error of float32 coordinates that is acce
 
 @dataclass(frozen=True)
 class PlyCloudFile:
-    """PLY file of points; see `CloudFile`. `dtype` is that of a vertex, `offset` the bytes before the first one."""
+    """PLY file of points; see `CloudFile`. `dtype` is that of a vertex, `offset` the bytes before the first one.
+
+    Of an ASCII file, `is_text`, `offset` is that of the first line of a vertex.
+    """
 
     path: Path
     count: int
     dtype: np.dtype[np.void]
     offset: int
     crs: FileCrs = field(default_factory=FileCrs)
+    is_text: bool = False
+    is_single: bool = False  # whether the header calls the coordinates floats of 32 bits
 
     def chunks(self, size: int) -> Iterator[CloudChunk]:
         """Yield all points in chunks of at most `size`.
@@ -66,28 +73,55 @@ class PlyCloudFile:
         Raises:
             InputError: coordinates are too large for the precision of their type.
         """
-        rows = np.memmap(self.path, dtype=self.dtype, mode="r", offset=self.offset, shape=(self.count,))
-        for first in range(0, self.count, size):
-            part = rows[first : first + size]
+        for part in self._text_parts(size) if self.is_text else self._binary_parts(size):
             position = np.column_stack([part[axis] for axis in "xyz"]).astype(np.float64)
-            self._check_precision(position)
+            if self.is_single:
+                check_precision(position, np.float32, self.path)
             classes, none = self._column(part, _CLASS_NAMES), np.zeros(len(part), dtype=bool)
             kinds = np.zeros(len(part)) if classes is None else np.clip(classes, 0, 255)
             yield CloudChunk(position, kinds.astype(np.uint8), none, none, self._column(part, _TIME_NAMES))
+
+    def _binary_parts(self, size: int) -> Iterator[np.ndarray]:
+        rows = np.memmap(self.path, dtype=self.dtype, mode="r", offset=self.offset, shape=(self.count,))
+        for first in range(0, self.count, size):
+            yield rows[first : first + size]
+
+    def _text_parts(self, size: int) -> Iterator[np.ndarray]:
+        names = self.dtype.names or ()
+        with reading(self.path), self.path.open("rb") as file:
+            file.seek(self.offset)
+            for first in range(0, self.count, size):
+                lines = list(itertools.islice(file, min(size, self.count - first)))
+                try:
+                    if len(lines) < min(size, self.count - first):
+                        raise ValueError(f"there are {first + len(lines)} of {self.count} lines of vertices")
+                    values = np.array([line.split()[: len(names)] for line in lines], dtype=np.float64)
+                    part = np.empty(len(lines), self.dtype)
+                    set_columns(part, names, values.reshape(len(lines), len(names)))
+                except (ValueError, OverflowError) as error:
+                    message = f"The vertices of the PLY are damaged: {str(error)[:160]}"
+                    raise InputError("file-damaged", message, path=self.path) from error
+                yield part
+
+    def rest(self) -> list[bytes]:
+        """Return the lines after those of the vertices of an ASCII file."""
+        with reading(self.path), self.path.open("rb") as file:
+            file.seek(self.offset)
+            return list(itertools.islice(file, self.count, None))
 
     def _column(self, part: np.ndarray, names: tuple[str, ...]) -> np.ndarray | None:
         known = [name for name in names if name in (self.dtype.names or ())]
         return part[known[0]].astype(np.float64) if known else None
 
-    def _check_precision(self, position: np.ndarray) -> None:
-        if self.dtype["x"].itemsize == 8:
-            return
-        largest = float(np.nanmax(np.abs(position), initial=0.0))
-        if np.isfinite(largest) and np.spacing(np.float32(largest)) / 2 > _COARSEST_M:
-            step = np.spacing(np.float32(largest))
-            message = f"Coordinates of {largest:.0f} m in single precision are rounded to {step:.3f} m."
-            remedy = "Write the PLY with double coordinates, or LAZ."
-            raise InputError("single-precision", f"{message} {remedy}", path=self.path)
+
+def check_precision(position: FloatArray, kind: type[np.floating[Any]], path: Path) -> None:
+    """Refuse coordinates (P, 3) that numbers of a kind round by more than half a millimetre."""
+    largest = float(np.nanmax(np.abs(position), initial=0.0))
+    if np.isfinite(largest) and np.spacing(kind(largest)) / 2 > _COARSEST_M:
+        step = np.spacing(kind(largest))
+        message = f"Coordinates of {largest:.0f} m in single precision are rounded to {step:.3f} m."
+        remedy = "Write the file with double coordinates, or LAZ."
+        raise InputError("single-precision", f"{message} {remedy}", path=path)
 
 
 def open_cloud_ply(path: Path) -> PlyCloudFile:
@@ -98,17 +132,19 @@ def open_cloud_ply(path: Path) -> PlyCloudFile:
     """
     lines, offset, size = ply_header(path)
     form = next((line[1] for line in lines if line[:1] == ["format"] and len(line) > 1), "")
-    if form not in _ORDERS:
+    is_text = form == "ascii"
+    if form not in _ORDERS and not is_text:
         message = f"The format of the PLY is {form[:30]!r}: write it as binary_little_endian."
         raise InputError("ply-format", message, path=path)
     count, columns = _vertices(path, lines)
-    dtype = np.dtype([(name, _ORDERS[form] + kind) for name, kind in columns])
-    if count < 1 or offset + count * dtype.itemsize > size:
-        message = (
-            f"The header promises {count} points of {dtype.itemsize} bytes, the file has {max(size - offset, 0)}."
-        )
+    kinds = [(name, "<f8" if is_text else _ORDERS[form] + kind) for name, kind in columns]
+    dtype = np.dtype(kinds)
+    least = 2 * len(columns) if is_text else dtype.itemsize  # bytes of a point
+    if count < 1 or offset + count * least > size:
+        message = f"The header promises {count} points of {least} bytes, the file has {max(size - offset, 0)}."
         raise InputError("size-differs", f"{message} It is empty, cut off or damaged.", path=path)
-    return PlyCloudFile(path, count, dtype, offset)
+    is_single = "f4" in (kind for name, kind in columns if name in "xyz")
+    return PlyCloudFile(path, count, dtype, offset, is_text=is_text, is_single=is_single)
 
 
 def _vertices(path: Path, lines: list[list[str]]) -> tuple[int, list[tuple[str, str]]]:

@@ -63,8 +63,8 @@ class LidarFlight:
         self._options, self._axes = options, scene.axes
         self._rng = np.random.default_rng(seed)
         self.changed = _changed_building(options, scene)
-        self._mesh = _scanned_mesh(options, scene, self.changed)
-        self._rays = Raycaster(self._mesh)
+        self.mesh = _scanned_mesh(options, scene, self.changed)
+        self._rays = Raycaster(self.mesh)
         self.returns = self.returns_of_change = 0
 
     def strips(self) -> Iterator[Strip]:
@@ -110,7 +110,7 @@ class LidarFlight:
         beam = down + slope[:, None] * right
         beam /= np.linalg.norm(beam, axis=1, keepdims=True)
         hits = self._rays.first_hits(place, beam)
-        normal = self._mesh.normals[hits.triangle, 0].astype(np.float64)
+        normal = self.mesh.normals[hits.triangle, 0].astype(np.float64)
         incidence = np.abs(np.einsum("ni,ni->n", normal, beam))
         returned = (hits.triangle != MISS) & (incidence > _GRAZING) & (rng.random(len(beam)) > options.lidar_missed)
         range_m = hits.distance.astype(np.float64)
@@ -122,7 +122,7 @@ class LidarFlight:
         noisy = noisy + rng.normal(0, options.lidar_sigma, len(beam))
         measured = place + noisy[:, None] * beam + self._systematic(time_s, along, right)
         kinds = np.array([_CLASS_OF.get(material, UNCLASSIFIED) for material in Material], dtype=np.uint8)
-        classes = np.where(from_air, NOISE, kinds[self._mesh.material[hits.triangle]]).astype(np.uint8)
+        classes = np.where(from_air, NOISE, kinds[self.mesh.material[hits.triangle]]).astype(np.uint8)
         of_change = self._on_change(true) & ~from_air
         self.returns += int(returned.sum())
         self.returns_of_change += int((of_change & returned).sum())

@@ -15,7 +15,7 @@ from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
 from pipelines.geometry.trajectory import Trajectory
-from pipelines.surface.measured_cloud import CloudReader, Thinning, read_thinned
+from pipelines.surface.measured_cloud import MeasuredCloud, MeasuredFiles, Thinning, read_thinned
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
@@ -104,7 +104,7 @@ class LidarCloud(Rows):
 
 
 def read_cloud(
-    files: CloudReader,
+    files: MeasuredFiles,
     scene: Scene,
     survey: Survey,
     pixel_m: float,
@@ -130,11 +130,20 @@ def read_cloud(
             field="--lidar",
         )
     model_from_geo = scene.geo_from_model.inverse()
-    scanner = None if track is None else model_from_geo.apply(track.at(cloud.gps_time_s))
+    places = _stations_of(files, cloud) if track is None else track.at(cloud.gps_time_s)
+    scanner = None if places is None else model_from_geo.apply(places)
     planes = planes_of(
         model_from_geo.apply(cloud.position_in_geo), cloud.classification, cloud.voxel_m, cloud.weight
     )
     return replace(planes, scanner_in_model=scanner)
+
+
+def _stations_of(files: MeasuredFiles, cloud: MeasuredCloud) -> FloatArray | None:
+    """Return the places (P, 3) from which points were measured, NaN where unknown; None: nowhere known."""
+    stations = files.stations_in_geo
+    if stations is None:
+        return None
+    return np.where((cloud.station >= 0)[:, None], stations[cloud.station], np.nan)
 
 
 def planes_of(

@@ -6,18 +6,55 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from pipelines.core.options import WRITTEN, ExtraMarker, InputMarker, StageOptions, from_text
+from pipelines.core.extras import require
+from pipelines.core.options import WRITTEN, ExtraMarker, InputMarker, NeedMarker, StageOptions, from_text, triple_of
+from pipelines.core.types import Vector3
+from pipelines.formats.depth_image import DEPTH_SUFFIXES
 from pipelines.geodesy.vertical import Vertical, VerticalChoice
 
 BOUNDARY_SUFFIXES = frozenset({".geojson", ".json", ".gpkg", ".kml", ".kmz", ".dxf"})
 LEAST_PHOTOGRAPHS = 3  # that see the ground of the area of interest: two do not check each other
-CLOUD_SUFFIXES = frozenset({".las", ".laz", ".ply"})
+CLOUD_SUFFIXES = frozenset({".las", ".laz", ".ply", ".e57", ".obj", ".glb"})
 NOT_IN_BLOCKS = (
     "a training in blocks does not use LiDAR: its shift is estimated against the depth maps of all photographs. "
     "Omit --lidar, or train in one run: `--blocks 1`, with a smaller --max-gaussians or --max-image-size where "
     "memory is short"
 )
-CloudPath = Annotated[Path, InputMarker(CLOUD_SUFFIXES)]
+# Files beside a mesh that say where it lies (formats/mesh_place.py).
+_PLACES = ("*.georef.json", "coords.txt", "metadata.xml", "*offset.xyz", "*offset.txt", "*.prj")
+_MESHES = tuple((suffix, _PLACES) for suffix in (".obj", ".glb", ".ply"))
+_PLACE_SUFFIXES = frozenset({".json", ".txt", ".xml", ".xyz", ".prj"})
+_NEEDS_SCANS = frozenset({".e57", ".exr"})
+
+
+def _require_scans(path: Path) -> None:
+    """Raise a BackendUnavailableError if a path holds a file that needs an extra which is missing."""
+    files = path.rglob("*") if path.is_dir() else (path,)
+    if any(file.suffix.lower() in _NEEDS_SCANS for file in files):
+        require("scans")
+
+
+CloudPath = Annotated[
+    Path,
+    InputMarker(CLOUD_SUFFIXES | _PLACE_SUFFIXES, beside=_MESHES),
+    NeedMarker(_require_scans),
+]
+
+# Clouds and meshes, or depth maps of the photographs.
+MeasuredPath = Annotated[
+    Path,
+    InputMarker(CLOUD_SUFFIXES | _PLACE_SUFFIXES | DEPTH_SUFFIXES, beside=_MESHES),
+    NeedMarker(_require_scans),
+]
+
+
+def _offset(numbers: Vector3) -> Vector3:
+    if not all(abs(number) < 1e8 for number in numbers):
+        raise ValueError("each number must be below 100000000 in magnitude")
+    return numbers
+
+
+MapOffset = Annotated[Vector3, from_text(triple_of), AfterValidator(_offset), WRITTEN]
 
 
 @dataclass(frozen=True)
@@ -28,6 +65,7 @@ class CloudCrs:
     vertical: VerticalChoice | None = None  # datum of the heights
     # Option that named the clouds, for errors: `--lidar` has `--lidar-crs` and `--lidar-vertical`
     flag: str = "--lidar"
+    offset: Vector3 | None = None  # added to the coordinates of the files, in their unit
 
 
 class CrsOptions(StageOptions):

@@ -25,7 +25,8 @@ from pipelines.splat.losses import FreeSpace
 from pipelines.surface.crossings import count_beams
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import LidarCloud, ScannerTrack, read_cloud
-from pipelines.surface.measured_cloud import CloudReader
+from pipelines.surface.measured_cloud import MeasuredFiles
+from pipelines.surface.photo_depths import PhotoDepths
 from pipelines.surface.registration import Registration, registration
 from pipelines.surface.visibility import DepthViews, Viewpoints
 from pipelines.survey.report_parts import LidarArea, LidarRegistration, LidarReport
@@ -42,6 +43,12 @@ _ANOTHER_DATUM_M = 1.0
 _HEIGHT_CELL_M = 4.0
 _STRIDE = 3  # of rows and columns of the depth maps, for the surface that they show
 _MOST_LISTED = 50
+_DATUM = (
+    "vertical datums or units of height differ. State the LiDAR's datum with --lidar-vertical or --lidar-crs, and "
+    "the survey's with `georef ingest --vertical`."
+)
+_PLACE = "the cloud is of another place or time, or its CRS is wrong (--lidar-crs)."
+_UNIT = "the unit (--depth-unit), the direction (--depth-along) and the camera (--depth-camera) of the depth maps."
 # Of the planes that the adjustment takes.
 _CLUSTER_M = 5.0
 _LEAST_POINTS = 5
@@ -78,7 +85,7 @@ class LidarSurface:
 
 def compared_lidar(
     options: LidarOptions,
-    files: CloudReader,
+    files: MeasuredFiles,
     maps: DepthMaps,
     survey: Survey,
     *,
@@ -91,16 +98,18 @@ def compared_lidar(
 
     The georeference is the initial similarity to `geo`, with covariance. Track None: it is unknown.
     """
+    if isinstance(files, PhotoDepths):
+        files.check(maps)
     pixel_m, views, surface = _pixel_size_m(maps), _depth_views(maps), SceneSurface(maps)
     cloud = read_cloud(files, maps.scene, survey, pixel_m, progress=progress, track=track)
     shown = np.concatenate([surface.points(index, _STRIDE) for index in map(int, maps.scene.train)])
-    found = registration_of(cloud, shown, views, seed)
+    found = registration_of(cloud, shown, views, seed, depths=isinstance(files, PhotoDepths))
     record = _checked(found, cloud, maps.scene, georeference, options)
     return ComparedLidar(cloud, maps, views, shown, pixel_m, found, record)
 
 
 def lidar_surface(
-    compared: ComparedLidar, files: CloudReader, survey: Survey, options: LidarOptions, shift_m: FloatArray | None
+    compared: ComparedLidar, files: MeasuredFiles, survey: Survey, options: LidarOptions, shift_m: FloatArray | None
 ) -> LidarSurface:
     """Return the surface of stereo and LiDAR, without a shift (3,) of the LiDAR, axes of geo; None: none."""
     cloud = compared.cloud if shift_m is None else compared.cloud.moved(-shift_m)
@@ -148,8 +157,10 @@ def _depth_views(maps: DepthMaps) -> DepthViews:
     return DepthViews.of(cameras, np.concatenate([np.asarray(maps.depth(index)).ravel() for index in train]))
 
 
-def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, seed: int) -> Registration:
-    """Return the shift of a cloud against the depth maps.
+def registration_of(
+    cloud: LidarCloud, shown: FloatArray, views: DepthViews, seed: int, *, depths: bool = False
+) -> Registration:
+    """Return the shift of a cloud against the depth maps of stereo; `depths`: it is of measured depth maps.
 
     Raises:
         InputError: the cloud lies above or below the surface of the photographs by more than the search reaches,
@@ -160,8 +171,7 @@ def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, see
         raise InputError(
             "lidar-height-offset",
             f"The LiDAR lies {abs(height_m):.2f} m {'above' if height_m > 0 else 'below'} the surface of the "
-            f"photographs (median of {cells} places): vertical datums or units of height differ. State the LiDAR's "
-            "datum with --lidar-vertical or --lidar-crs, and the survey's with `georef ingest --vertical`.",
+            f"photographs (median of {cells} places): {'check ' + _UNIT if depths else _DATUM}",
             field="--lidar",
         )
     try:
@@ -169,7 +179,7 @@ def registration_of(cloud: LidarCloud, shown: FloatArray, views: DepthViews, see
     except DegenerateGeometryError as error:
         raise InputError(
             error.code,
-            f"{error}: the cloud is of another place or time, or its CRS is wrong (--lidar-crs).",
+            f"{error}: {'check ' + _UNIT if depths else _PLACE}",
             field="--lidar",
         ) from error
 
@@ -252,11 +262,15 @@ def _checked(
     text = ", ".join(f"{value:+.3f} ± {one:.3f}" for value, one in zip(compared.shift_m, sigma, strict=True))
     log.info("lidar: shift east, north, up %s m against the photographs, of %d points", text, record.points)
     if (np.abs(compared.shift_m) > _GATE_SIGMAS * sigma).any() and not options.lidar_register:
+        remedy = (
+            "Check its CRS, its datum and the survey's georeference. --lidar-register removes the shift; "
+            "--lidar-sigma states a lower accuracy."
+        )
+        if options.depth_unit is not None:
+            remedy = f"Check {_UNIT} --lidar-sigma states a lower accuracy."
         raise InputError(
             "lidar-shifted",
-            f"The LiDAR is shifted by {text} m (east, north, up) from the photographs, more than 3 σ. Check its "
-            "CRS, its datum and the survey's georeference. --lidar-register removes the shift; --lidar-sigma "
-            "states a lower accuracy.",
+            f"The LiDAR is shifted by {text} m (east, north, up) from the photographs, more than 3 σ. {remedy}",
             field="--lidar",
         )
     return record

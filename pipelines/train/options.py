@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from pipelines.core.errors import InputError
-from pipelines.core.options import InputPath, StageOptions
+from pipelines.core.options import WRITTEN, InputPath, StageOptions, flag_name, from_text
 from pipelines.geodesy.vertical import Vertical
 from pipelines.splat.rasterizer.choice import Backend
-from pipelines.survey.options import AreaOptions, CloudPath
+from pipelines.survey.options import AreaOptions, MapOffset, MeasuredPath
 
 
 @dataclass(frozen=True)
@@ -50,11 +51,61 @@ _EFFORTS = "; ".join(f"{name}: {preset}, about {RUN_MINUTES[name]} min" for name
 LidarLoss = Literal["depth", "gaussians", "both"]
 
 
+DepthAlong = Literal["axis", "ray"]
+_UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
+
+
+def _unit(text: str) -> float:
+    if text.strip().lower() in _UNITS_M:
+        return _UNITS_M[text.strip().lower()]
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is none of {', '.join(_UNITS_M)}, and no number of metres") from None
+
+
+def _four(text: str) -> tuple[float, ...]:
+    parts = text.split(",")
+    if len(parts) != 4:
+        raise ValueError(f"{text!r} is not four numbers with commas: fx,fy,cx,cy")
+    return tuple(float(part) for part in parts)
+
+
+def _positive_focal(camera: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if not (camera[0] > 0 and camera[1] > 0):
+        raise ValueError("fx and fy must be positive")
+    return camera
+
+
+DepthUnit = Annotated[float, from_text(_unit), Field(gt=0, le=1000), WRITTEN]
+DepthCamera = Annotated[
+    tuple[float, float, float, float], from_text(_four), AfterValidator(_positive_focal), WRITTEN
+]
+
+
+# Options that belong to one kind of measured geometry.
+_OF_CLOUDS = ("lidar_crs", "lidar_vertical", "lidar_offset", "lidar_trajectory", "lidar_register")
+_OF_DEPTHS = ("depth_unit", "depth_along", "depth_camera")
+_OF_LIDAR = (*_OF_CLOUDS, *_OF_DEPTHS)
+
+
+def _flags(names: Sequence[str]) -> str:
+    return ", ".join(flag_name(LidarOptions, name) for name in names)
+
+
 class LidarOptions(StageOptions):
     """Options of a LiDAR cloud: where it lies, how accurate it is, and how training uses it."""
 
-    lidar: CloudPath | None = Field(
-        None, description="LiDAR of the same place, for the surface: LAS, LAZ or PLY, or a folder of tiles."
+    lidar: MeasuredPath | None = Field(
+        None,
+        description="Measured geometry of the same place, for the surface: a cloud (LAS, LAZ, E57, PLY) or a mesh "
+        "(PLY, OBJ, GLB), or a folder of such files; or a folder of depth maps of the photographs (PNG, TIFF, "
+        "EXR).",
+    )
+    lidar_offset: MapOffset | None = Field(
+        None,
+        description="Easting, northing and height that are added to the coordinates of the LiDAR's files, in their "
+        "unit. It overrules what files beside a mesh state.",
     )
     lidar_crs: str | None = Field(None, description="CRS of the LiDAR. It overrules what its files state.")
     lidar_vertical: Vertical | None = Field(
@@ -71,16 +122,40 @@ class LidarOptions(StageOptions):
         description="Losses of the LiDAR: on rendered depth, on distances of Gaussians from its planes, or both.",
     )
     lidar_register: bool = Field(False, description="Estimate a shift of the LiDAR and remove it.")
+    depth_unit: DepthUnit | None = Field(
+        None,
+        description="Unit of depth maps, which need it: m, cm, mm, ft, or the metres of a value of 1, such as "
+        "0.0002.",
+    )
+    depth_along: DepthAlong | None = Field(
+        None,
+        description="Whether depths of depth maps count along the optical axis or along the ray of each pixel. "
+        "Without it: what fits the depths of stereo.",
+    )
+    depth_camera: DepthCamera | None = Field(
+        None,
+        description="Camera of the depth maps where they do not show the photographs' own pixels: fx,fy,cx,cy in "
+        "pixels of the maps, whose first has its centre at 0.5,0.5. Place and axes are the photograph's.",
+    )
 
     @model_validator(mode="after")
     def _used(self) -> LidarOptions:
-        if self.lidar is None and (
-            self.lidar_crs or self.lidar_vertical or self.lidar_trajectory or self.lidar_register
-        ):
-            raise ValueError(
-                "--lidar-crs, --lidar-vertical, --lidar-trajectory and --lidar-register belong to --lidar"
-            )
+        given = [flag for flag in _OF_LIDAR if getattr(self, flag)]
+        if self.lidar is None and given:
+            raise ValueError(f"{_flags(given)} {'belong' if len(given) > 1 else 'belongs'} to --lidar")
         return self
+
+    def require_kind(self, *, depths: bool) -> None:
+        """Raise an InputError for options that do not belong to depth maps, or to clouds and meshes."""
+        wrong = [flag for flag in (_OF_CLOUDS if depths else _OF_DEPTHS) if getattr(self, flag)]
+        if wrong:
+            what = "depth maps, which lie in the frame of the photographs" if depths else "clouds and meshes"
+            raise InputError("option-of-another-kind", f"{_flags(wrong)}: not for {what}.", field=_flags(wrong[:1]))
+        if depths and self.depth_unit is None:
+            message = (
+                "Depth maps have no unit of their own: give --depth-unit mm, m, or the metres of a value of 1."
+            )
+            raise InputError("depth-unit-unknown", message, path=self.lidar, field="--depth-unit")
 
 
 # A dense basis of more cameras takes more than 2 GiB (`geometry.bundle.correction_basis`).

@@ -29,14 +29,15 @@ from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.rasterizer.mip_filter import MipFiltered
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import ScannerTrack
-from pipelines.surface.measured_cloud import CloudReader
+from pipelines.surface.measured_cloud import CloudReader, MeasuredFiles
+from pipelines.surface.photo_depths import DepthStatement, PhotoDepths, holds_depth_maps
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.area import boundary_area
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.report_parts import EstimatedError, LidarReport
-from pipelines.survey.scene import photographs
+from pipelines.survey.scene import Scene, photographs
 from pipelines.survey.trained_model import Adjustment, LensVignetting, TrainedModel
 from pipelines.train.adjusted_scene import AdjustedScene, figures_of, with_exposures
 from pipelines.train.compilation import compile_kernels
@@ -73,11 +74,10 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     # First, so that `--backend cuda` without a GPU fails at once.
     backend = rasterizer(options.backend, stage.progress, mip_filter=options.mip_filter)
     workspace = stage.workspace
-    stated = CloudCrs(options.lidar_crs, options.lidar_vertical)
-    clouds = None if options.lidar is None else CloudReader(options.lidar, stated)
     adjusted, path = AdjustedScene.load(workspace), options.lidar_trajectory
     survey, scene = adjusted.survey, adjusted.scene
-    track = None if path is None else ScannerTrack.read(path, stated, survey.origin_on_earth)
+    clouds = measured_files(options, scene)
+    track = None if path is None else ScannerTrack.read(path, _stated_crs(options), survey.origin_on_earth)
     options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     options = _within_memory(options, images, free_memory_bytes(backend.device))
@@ -123,6 +123,23 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     model = _write_solution(stage, trainer, adjusted.adjustment, posterior)
     metrics = [json.loads(row) for row in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
     return _summary(model, metrics, record, None if lidar is None else lidar.report)
+
+
+def measured_files(options: TrainOptions, scene: Scene) -> MeasuredFiles | None:
+    """Return the files of `--lidar`, checked; None: there are none."""
+    if options.lidar is None:
+        return None
+    depths = holds_depth_maps(options.lidar)
+    options.require_kind(depths=depths)
+    if not depths:
+        return CloudReader(options.lidar, _stated_crs(options))
+    unit_m = 1.0 if options.depth_unit is None else options.depth_unit
+    said = DepthStatement(unit_m, options.depth_along, options.depth_camera, options.lidar_sigma)
+    return PhotoDepths(options.lidar, scene, said)
+
+
+def _stated_crs(options: TrainOptions) -> CloudCrs:
+    return CloudCrs(options.lidar_crs, options.lidar_vertical, offset=options.lidar_offset)
 
 
 def _within_memory(options: TrainOptions, images: ImageCache, free_bytes: int | None) -> TrainOptions:

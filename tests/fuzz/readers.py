@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import cv2
 import laspy
 import numpy as np
+import trimesh
 from plyfile import PlyData, PlyElement
 from pydantic import BaseModel
 from pyproj import CRS
@@ -27,6 +28,7 @@ from pipelines.core.staleness import status
 from pipelines.core.workspace import Manifest, Workspace
 from pipelines.formats.bag import COMPRESSED, IMAGE, BadImageError, ImageWriter, UndecodableError, open_bag
 from pipelines.formats.colmap import pycolmap_module, read_sparse
+from pipelines.formats.e57 import open_e57
 from pipelines.formats.exif import read_tags
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path, write_sidecar
 from pipelines.formats.gnss_logs import read_mrk, read_pos, read_subtitles
@@ -62,6 +64,7 @@ from pipelines.survey.trained_model import TrainedModel
 from pipelines.train.trainer import load_checkpoint
 from tests import bags, foreign_files, gopro
 from tests.formats.test_surveyors_tables import DEGREES, MRK, POS_HEAD, REFERENCE, SIGMAS, TAIL, XML
+from tests.geometry_files import ScanFile, write_e57, write_exr
 from tests.oracles import read_spz
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg
 from tests.reports import check_points_with, report_with
@@ -277,6 +280,29 @@ def _read_clouds(folder: Path) -> None:
         assert np.isfinite(chunk.position_in_geo).all()
 
 
+def _meshes(folder: Path) -> None:
+    corners = np.array([[4e5, 5.1e6, 600.0], [4e5, 5.1e6 + 1, 600.0], [4e5 + 1, 5.1e6, 601.0]])
+    mesh = trimesh.Trimesh(corners - corners[0].round(), [[0, 1, 2]], process=False)
+    for name in ("a.obj", "b.glb", "c.ply"):
+        mesh.export(folder / name)
+    mesh.export(folder / "d.ply", encoding="ascii")
+    (folder / "coords.txt").write_text("WGS84 UTM 32N\n400000 5100000\n")
+    (folder / "metadata.xml").write_text("<M><SRS>EPSG:32632</SRS><SRSOrigin>400000,5100000,0</SRSOrigin></M>")
+
+
+def _e57(folder: Path) -> None:
+    points = np.array([[1.0, 2.0, 3.0], [2.0, 2.5, 3.5]])
+    write_e57(folder / "a.e57", [ScanFile(points)], kind="scaled", crs="EPSG:32632")
+    write_e57(folder / "b.e57", [ScanFile(points), ScanFile(points)], kind="spherical")
+
+
+def _depth_maps(folder: Path) -> None:
+    values = np.full((12, 16), 7.0)
+    write_exr(folder / "a.exr", {"Z": values.astype(np.float32)})
+    cv2.imwrite(str(folder / "b.png"), values.astype(np.uint16))
+    cv2.imwrite(str(folder / "c.tif"), values.astype(np.float32))
+
+
 def _spz(folder: Path) -> None:
     _splat(folder)
     splat = read_splat_ply(folder / "a.ply")
@@ -459,6 +485,10 @@ READERS: dict[str, Reader] = {
     "bag-ros1": Reader(_bag1, _read_bag("*.bag")),
     "spz": Reader(_spz, lambda folder: (read_spz(folder / "a.spz"), read_spz(folder / "b.spz"))),
     "clouds": Reader(_clouds, _read_clouds),
+    "e57": Reader(
+        _e57, lambda folder: [_attempt(lambda p=p: list(open_e57(p).chunks(9))) for p in folder.iterdir()]
+    ),
+    "meshes": Reader(_meshes, _read_clouds),
     "splat-ply": Reader(_splat, lambda folder: read_splat_ply(folder / "a.ply")),
     "sidecar": Reader(_sidecar, _read_sidecar),
     "products": Reader(_products, _read_products),

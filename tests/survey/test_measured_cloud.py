@@ -155,9 +155,9 @@ def test_files_without_crs_need_one(tmp_path: Path) -> None:
         CloudReader(tmp_path / "c.las", CloudCrs())
     assert raised.value.path == tmp_path / "c.las" and "--lidar-crs" in str(raised.value)
     np.testing.assert_allclose(all_points(tmp_path / "c.las", CloudCrs(crs=UTM)), points, atol=0.6 * STEP_M)
-    (tmp_path / "scan.e57").write_bytes(b"ASTM-E57")
+    (tmp_path / "scan.ptx").write_bytes(b"1")
     with refused("format-unknown", InputError):
-        CloudReader(tmp_path / "scan.e57", CloudCrs())
+        CloudReader(tmp_path / "scan.ptx", CloudCrs())
 
 
 def test_single_precision_of_large_coordinates_is_refused(tmp_path: Path) -> None:
