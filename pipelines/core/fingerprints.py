@@ -121,7 +121,9 @@ def _values(path: Path, part: ProductPart) -> dict[str, Any] | None:
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
     if part.fields:
-        return {name: _value(document, name.split(".")) for name in part.fields}
+        values = {name: _value(document, name.split(".")) for name in part.fields}
+        further = {name: _value(document, name.split(".")) for name in part.if_any}
+        return values | {name: value for name, value in further.items() if value}
     if not isinstance(document, dict):
         return None
     return {name: value for name, value in document.items() if name not in part.without}

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pipelines.core.options import StageOptions
 
 SURVEY = "ingest/survey.json"
+RIG_MODEL = "sfm/rig"  # the whole model, where the survey has companions
 MASKS = "ingest/masks"  # of the photographs that have one
 TRACK = "ingest/track.npz"  # only for surveys with a trajectory
 SPARSE = "sfm/sparse"
@@ -63,6 +64,7 @@ class ProductPart:
         product: workspace path of a file or a folder.
         fields: paths of keys in the JSON document, through every item of a list: `images.fix.position_in_geo`.
             No other field of the document makes the stage stale. Without fields, the whole product counts.
+        if_any: further fields, which count where they have a value: a document without them is as it was.
         without: keys of the JSON document that do not count, where `fields` names none.
         optional: whether the stage runs without this product. A part without any value then counts as missing.
         brings: further products that count if they exist and this part has a value.
@@ -70,6 +72,7 @@ class ProductPart:
 
     product: str
     fields: tuple[str, ...] = ()
+    if_any: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     optional: bool = False
     brings: tuple[str, ...] = ()
@@ -97,6 +100,7 @@ PHOTOGRAPHS = ProductPart(
         "images.velocity_in_geo",
         "images.mask_sha256",
     ),
+    if_any=("companions.name", "companions.camera_id", "companions.sha256", "companions.beside"),
 )
 # The estimates that are applied to the survey when the survey is read, and the navigation that they are applied to.
 APPLIED_RIG = ProductPart(

@@ -5,8 +5,8 @@ until the survey's frame is known. Lever arm and boresight lead from the places 
 measured to those of the cameras.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -22,6 +22,7 @@ from pipelines.geometry.trajectory import Rig, Trajectory, mount, with_rig
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
+from pipelines.ingest.rig_instants import Accompanying, Quaternion
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.survey import CameraPrior
 
@@ -101,7 +102,11 @@ class RecordedNavigation:
 
 @dataclass(frozen=True)
 class FlightRecord:
-    """What was read of a flight; `navigation` is None where it was not recorded by time."""
+    """What was read of a flight; `navigation` is None where it was not recorded by time.
+
+    `accompanying` are photographs of the other lenses of a rig, and `rotations` the stated ones of these lenses,
+    lens ← reference as x, y, z, w, by photograph.
+    """
 
     folder: Path
     photos: list[Photo]
@@ -109,6 +114,8 @@ class FlightRecord:
     camera_of: dict[str, int]
     poses: ImagePoses
     navigation: RecordedNavigation | None
+    accompanying: tuple[Accompanying, ...] = ()
+    rotations: Mapping[str, Quaternion] = field(default_factory=dict)
 
 
 def kind_of_receiver(receiver: str, sigma_h_m: float) -> str:

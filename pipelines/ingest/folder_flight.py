@@ -27,7 +27,8 @@ from pipelines.ingest.photo_folder import Photo, camera_priors, scan_folder
 from pipelines.ingest.photo_times import with_times
 from pipelines.ingest.reference_system import is_projected
 from pipelines.ingest.remarks import Remarks
-from pipelines.ingest.sensors import chosen_sensor, with_sensors
+from pipelines.ingest.rig_instants import photos_of_rig
+from pipelines.ingest.sensors import with_sensors
 from pipelines.ingest.stray_pictures import (
     with_sharpness,
     without_blurred,
@@ -60,12 +61,18 @@ def read_folder(
     """
     photos = without_panoramas(scan_folder(folder, remarks, progress, decode=decode), remarks)
     photos = without_reduced_copies(with_sensors(photos), remarks)
-    photos = with_sharpness(chosen_sensor(photos, options.sensor, remarks) if photos else photos)
+    photos, accompanying, rotations = photos_of_rig(photos, options.sensor, options.rig, remarks)
+    photos = with_sharpness(photos)
     photos = without_blurred(photos, remarks) if options.skip_blurred else photos
     flight_record.require_enough(len(photos), folder, "--images", remarks)
     photos = with_times(photos, remarks)
     note_tags(photos, remarks)
-    poses = _poses(photos, options, remarks) if table is None else poses_from_table(table, photos, options, remarks)
+    others = {each.photo.name for each in accompanying}
+    poses = (
+        _poses(photos, options, remarks, others)
+        if table is None
+        else poses_from_table(table, photos, options, remarks)
+    )
     if options.time_offset_s and poses.recorded is None:
         raise InputError(
             "time-offset-without-times",
@@ -80,17 +87,26 @@ def read_folder(
     if poses.recorded is not None:
         navigation = _navigation(poses.recorded, rig, names, poses.time_s, options)
     poses = flight_record.at_cameras(poses, rig, names, remarks)
-    cameras, camera_of = camera_priors(photos, options.focal_px, remarks)
-    return flight_record.FlightRecord(folder.resolve(), photos, cameras, camera_of, poses, navigation)
+    accompanying = tuple(each for each in accompanying if each.beside in names)
+    everything = [*photos, *(each.photo for each in accompanying)]
+    cameras, camera_of = camera_priors(everything, options.focal_px, remarks)
+    return flight_record.FlightRecord(
+        folder.resolve(), photos, cameras, camera_of, poses, navigation, accompanying, rotations
+    )
 
 
-def _poses(photos: list[Photo], options: IngestOptions, remarks: Remarks) -> flight_record.ImagePoses:
+def _poses(
+    photos: list[Photo], options: IngestOptions, remarks: Remarks, others: set[str]
+) -> flight_record.ImagePoses:
+    """Return the poses of photographs; rows of a table that name `others`, of a rig's other lenses, are skipped."""
     if options.trajectory is not None:
         table = _read_positions(options.trajectory, photos, options, remarks)
     elif options.geo is not None:
         table = read_geo(options.geo)
     else:
         return poses_from_tags(photos, options, remarks)
+    if others and table.names is not None:
+        table = table.take(np.array([name not in others for name in table.names]))
     if options.events is None:
         if not options.time_offset and not options.estimated:
             table = rows_by_order(table, photos, remarks) or table

@@ -86,7 +86,13 @@ class IngestOptions(StageOptions):
     sensor: str | None = Field(
         None,
         description="Sensor whose photographs are used, where the folder holds several: visible, wide, zoom, "
-        "thermal, or a band such as green, red, red-edge, nir (default: a visible one).",
+        "thermal, or a band such as green, red, red-edge, nir (default: a visible one); all: those that were "
+        "exposed together with it, too, as a rig.",
+    )
+    rig: InputPath | None = Field(
+        None,
+        description="COLMAP's rig_config.json: prefixes of the names of photographs that several lenses exposed "
+        "together. The rig has one pose at each instant; the splat is trained from the reference lens.",
     )
     bag: InputPath | None = Field(
         None, description="ROS bag with photographs and navigation: rosbag2 folder, .mcap, .db3 or ROS 1 .bag."
@@ -243,7 +249,7 @@ class IngestOptions(StageOptions):
 
 
 _BAG_ONLY = ("image_topic", "fix_topic", "attitude_topic", "every", "origin")
-_BESIDE_VIDEO = ("images", "bag", "geo", "events", "sensor")  # what --video excludes
+_BESIDE_VIDEO = ("images", "bag", "geo", "events", "sensor", "rig")  # what --video excludes
 
 
 def check_options(options: IngestOptions, frames: Path | None) -> None:
@@ -312,7 +318,9 @@ def _check_bag(options: IngestOptions, frames: Path | None) -> None:
             field="--crs",
         )
     beside = [
-        name for name in ("images", "sensor", "trajectory", "geo", "events") if getattr(options, name) is not None
+        name
+        for name in ("images", "sensor", "rig", "trajectory", "geo", "events")
+        if getattr(options, name) is not None
     ]
     if beside:
         raise InputError(

@@ -52,21 +52,23 @@ def with_common_scale(
         InputError: a photograph cannot be read any more.
     """
     of_camera: dict[int, list[Photo]] = {}
-    for photo in flight.photos:
+    everything = [*flight.photos, *(each.photo for each in flight.accompanying)]
+    for photo in everything:
         of_camera.setdefault(flight.camera_of[photo.name], []).append(photo)
     scales = {camera: scale for camera, photos in of_camera.items() if (scale := _scale(photos)) is not None}
     if not scales:
         return flight
     changed: dict[str, Photo] = {}
-    with progress.task("bit depth", len(flight.photos)) as task:
-        for photo in flight.photos:
+    with progress.task("bit depth", len(everything)) as task:
+        for photo in everything:
             scale = scales.get(flight.camera_of[photo.name])
             changed[photo.name] = _copied(photo, scale, flight.folder / photo.name, folder / photo.name)
             task.advance()
     for camera, scale in scales.items():
         _note(scale, of_camera[camera], remarks)
     photos = [changed[photo.name] for photo in flight.photos]
-    return replace(flight, folder=folder.resolve(), photos=photos)
+    accompanying = tuple(replace(each, photo=changed[each.photo.name]) for each in flight.accompanying)
+    return replace(flight, folder=folder.resolve(), photos=photos, accompanying=accompanying)
 
 
 def _scale(photos: Iterable[Photo]) -> _Scale | None:

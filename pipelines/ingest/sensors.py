@@ -99,7 +99,8 @@ def chosen_sensor(photos: Sequence[Photo], wanted: str | None, remarks: Remarks)
             "other-sensors",
             f"The photographs are of {len(counts)} sensors, each with a lens of its own. Those of the sensor "
             f"{' and '.join(f'{sensor} ({count})' for sensor, count in chosen)} are used, and the others are left "
-            f"out: {listed}. Choose another with --sensor {'|'.join(left)}.",
+            f"out: {listed}. Choose another with --sensor {'|'.join(left)}, or with --sensor all those that were "
+            "exposed together, as a rig.",
         )
     return kept
 
@@ -229,10 +230,10 @@ def _of_wavelength(nanometres: float) -> str:
 
 def _by_suffix(photos: Sequence[Photo], everything: Sequence[Photo]) -> dict[str, str]:
     """Return sensors by the last part of names such as `DJI_0007_T`, `IMG_0007_NIR`."""
-    parts = {photo.name: _last_part(photo.name) for photo in photos}
+    parts = {photo.name: name_and_lens(photo.name) for photo in photos}
     of_prefix: dict[str, set[str]] = {}
     for photo in everything:
-        prefix, suffix = _last_part(photo.name)
+        prefix, suffix = name_and_lens(photo.name)
         if suffix in _SUFFIXES:
             of_prefix.setdefault(prefix, set()).add(suffix)
     in_pairs = sum(len(suffixes) > 1 for suffixes in of_prefix.values()) > 1
@@ -250,7 +251,7 @@ def _by_suffix(photos: Sequence[Photo], everything: Sequence[Photo]) -> dict[str
     return found
 
 
-def _last_part(name: str) -> tuple[str, str]:
+def name_and_lens(name: str) -> tuple[str, str]:
     """Return a file's name up to its last underscore or hyphen, and what follows, both in small letters."""
     stem = PurePosixPath(name).stem.casefold()
     cut = max(stem.rfind("_"), stem.rfind("-"))
@@ -261,7 +262,7 @@ def _by_number(photos: Sequence[Photo], _all: Sequence[Photo]) -> dict[str, str]
     """Return the lenses of a rig by names such as `IMG_0007_1` … `_5`: grey pictures, alike in number and time."""
     groups: dict[str, dict[str, Photo]] = {}
     for photo in photos:
-        prefix, number = _last_part(photo.name)
+        prefix, number = name_and_lens(photo.name)
         if photo.file.channels < 3 and re.fullmatch(r"\d{1,2}", number):
             groups.setdefault(prefix, {})[number] = photo
     if len(groups) < 2:

@@ -29,6 +29,7 @@ from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, require_es
 from pipelines.survey.survey import (
     LOCAL_FRAME,
     Attitude,
+    Companion,
     Fix,
     FixSession,
     KnownDistance,
@@ -119,6 +120,7 @@ def assemble_survey(
         vertical=crs.local_frame().vertical if origin is None else _vertical(poses, files, remarks),
         image_dir=str(flight.folder),
         cameras=cameras,
+        companions=_companions(flight),
         images=with_velocities(images, cameras, None if track is None else track.positions, options, remarks),
         sessions=sessions,
         control_points=_surveyed(marked, origin, options),
@@ -210,6 +212,19 @@ def _images(
             sharpness=None if photo.sharpness is None else round(photo.sharpness, 3),
         )
         for row, photo in enumerate(flight.photos)
+    )
+
+
+def _companions(flight: flight_record.FlightRecord) -> tuple[Companion, ...]:
+    return tuple(
+        Companion(
+            name=each.photo.name,
+            camera_id=flight.camera_of[each.photo.name],
+            sha256=each.photo.file.sha256,
+            beside=each.beside,
+            stated_quat_xyzw=flight.rotations.get(each.photo.name),
+        )
+        for each in flight.accompanying
     )
 
 

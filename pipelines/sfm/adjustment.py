@@ -143,6 +143,9 @@ def _follow(colmap: Any, model: Any, leader: Any) -> None:
     model.transform(colmap.Sim3d(moved.matrix()[:3]))
     for key, camera in leader.cameras.items():
         model.cameras[key].params = camera.params
+    for key, rig in leader.rigs.items():
+        for sensor, pose in rig.non_ref_sensors.items():
+            model.rigs[key].set_sensor_from_rig(sensor, pose)
     for key, frame in leader.frames.items():
         if frame.has_pose():
             model.frames[key].rig_from_world = frame.rig_from_world

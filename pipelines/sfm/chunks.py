@@ -160,7 +160,7 @@ def write_chunk(arguments: Mapping[str, Any], progress: Progress) -> None:
     except DamagedPartialError as error:
         log.warning("%s starts afresh: %s", chunk.name, error)
         remove_database(draft)
-    survey = load_json(Survey, Path(arguments["survey"]))
+    survey = load_json(Survey, Path(arguments["survey"])).with_companions()
     masks = masks_beside(arguments["survey"], survey)
     job = SfmJob(survey, Path(arguments["images"]), draft, plan.options, masks)
     with quiet_colmap() as colmap:
@@ -216,7 +216,7 @@ def _planned(workspace: Workspace, name: str) -> Chunk:
     if chunk is None:
         names = f"{chunks[0].name} … {chunks[-1].name}" if chunks else "none"
         raise InputError("unknown-chunk", f"{name!r} is none of the chunks {names}", field="--chunk")
-    count = len(load_json(Survey, workspace.path(SURVEY)).images)
+    count = len(load_json(Survey, workspace.path(SURVEY)).with_companions().images)
     if max((*chunk.images, *(index for pair in chunk.pairs for index in pair)), default=0) >= count:
         message = f"{name} has more photographs than the survey. Run `georef sfm {workspace.root}`."
         raise InputError("chunk-plan-outdated", message, path=path)

@@ -2,12 +2,14 @@
 
 import logging
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from pipelines.core.errors import DegenerateGeometryError, InputError, ResourceError
 from pipelines.core.machine import chosen_threads, free_main_memory_bytes
 from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import Progress
+from pipelines.core.stages import RIG_MODEL
 from pipelines.core.workspace import StageRun
 from pipelines.formats.colmap import ROLLING_SHUTTER, quiet_colmap, write_reconstruction
 from pipelines.sfm.adjustment import adjust_finally
@@ -19,6 +21,7 @@ from pipelines.sfm.learned_weights import learned_remedy
 from pipelines.sfm.lens_check import lenses_astray
 from pipelines.sfm.mapping import triangulate
 from pipelines.sfm.options import SfmOptions
+from pipelines.sfm.rigs import reference_alone, with_rigs
 from pipelines.sfm.rolling_shutter import correct_tie_points
 from pipelines.sfm.rounds import align
 from pipelines.survey.survey import Survey
@@ -56,7 +59,11 @@ class ColmapReconstructor:
                 model, lens_held = reconstruct(colmap, job, progress)
             adjust = partial(_adjust, colmap, job, lens_held=lens_held, progress=progress)
             model, shutter = correct_tie_points(model, job.survey, adjust)
-            write_reconstruction(model, job.sparse)
+            if job.survey.companions:
+                write_reconstruction(model, job.sparse.with_name(Path(RIG_MODEL).name))
+                write_reconstruction(reference_alone(model, job.survey), job.sparse)
+            else:
+                write_reconstruction(model, job.sparse)
             if shutter is not None:
                 save_json(shutter, job.sparse / ROLLING_SHUTTER)
         remove_chunks(out)
@@ -104,6 +111,11 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> tuple[Any, bool
         fixes = {image.name: image.fix.position_in_geo for image in job.survey.images if image.fix is not None}
     if aligned.mapper == "global":
         complete = partial(triangulate, colmap, database=job.database, progress=progress)
+    if job.survey.companions:
+        if complete is not None:
+            complete(model)  # before the database's photographs have a pose each, and the model's one an instant
+            complete = None
+        model = with_rigs(colmap, job, model, lens_held=aligned.lens_held, progress=progress)
     mapped = type(model)(model) if aligned.lens_held else None
     _adjust(colmap, job, model, fixes=fixes, complete=complete, progress=progress)
     astray = lenses_astray(model, job.survey)

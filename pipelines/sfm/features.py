@@ -6,6 +6,7 @@ Pairs are chosen by positions and viewing directions. COLMAP works in small step
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +103,10 @@ def candidate_pairs(survey: Survey, options: SfmOptions) -> IntArray:
     """Return the pairs to match as indices (P, 2) into `survey.images`.
 
     All pairs are matched if there are up to 20 images, or if no image has a fix. Otherwise position and viewing
-    direction decide.
+    direction decide. Of a rig, they decide for the reference lens, and the others follow.
     """
+    if survey.companions:
+        return _pairs_of_rigs(survey, options)
     count = len(survey.images)
     located = any(image.fix for image in survey.images)
     if options.pairs == "exhaustive" or count <= _EXHAUSTIVE_UP_TO or not located:
@@ -117,6 +120,28 @@ def candidate_pairs(survey: Survey, options: SfmOptions) -> IntArray:
         ]
     )
     return select_pairs(position, axis, options.max_neighbors)
+
+
+def _pairs_of_rigs(survey: Survey, options: SfmOptions) -> IntArray:
+    """Return the pairs of a survey with companions among its images, which follow the others.
+
+    Each lens is matched with itself at the instants of which the reference lens's photographs are matched, and with
+    the others at the same instant.
+    """
+    number = {image.name: index for index, image in enumerate(survey.images)}
+    others = {each.name for each in survey.companions}
+    alone = tuple(image for image in survey.images if image.name not in others)
+    pairs = candidate_pairs(survey.model_copy(update={"images": alone, "companions": ()}), options).tolist()
+    of: dict[int, dict[int, int]] = {}
+    for each in survey.companions:
+        of.setdefault(number[each.beside], {})[each.camera_id] = number[each.name]
+    chosen = {(a, b) for a, b in pairs}
+    for a, b in pairs:
+        chosen |= {(of[a][lens], of[b][lens]) for lens in set(of.get(a, ())) & set(of.get(b, ()))}
+    for reference, lenses in of.items():
+        chosen |= set(combinations([reference, *lenses.values()], 2))
+    ordered = sorted((min(pair), max(pair)) for pair in chosen)
+    return np.array(ordered, dtype=np.int64).reshape(-1, 2)
 
 
 def extract_features(colmap: Any, job: SfmJob, images: Sequence[int], progress: Progress) -> None:

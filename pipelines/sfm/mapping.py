@@ -2,7 +2,7 @@
 
 import logging
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +39,8 @@ class MapperRun:
     threads: int
     seed: int
     lens_held: bool = False  # at what the database says, instead of being solved
+    names: Sequence[str] = ()  # of the photographs that are mapped; none: all
+    fewest: int = _FEWEST_IMAGES  # photographs of a model; two: points that two photographs alone show count
 
 
 def chosen_mapper(photographs: int, options: SfmOptions) -> MapperName:
@@ -88,7 +90,9 @@ def run_mapper(colmap: Any, mapper: MapperName, run: MapperRun, registered: Call
         models = colmap.global_mapping(run.database, run.images, run.scratch, options)
     else:
         options = colmap.IncrementalPipelineOptions()
-        options.num_threads, options.random_seed, options.min_model_size = run.threads, run.seed, _FEWEST_IMAGES
+        options.num_threads, options.random_seed, options.min_model_size = run.threads, run.seed, run.fewest
+        options.image_names = list(run.names)
+        options.triangulation.ignore_two_view_tracks = run.fewest > 2
         if run.lens_held:
             options.ba_refine_focal_length = options.ba_refine_extra_params = False
         models = colmap.incremental_mapping(
@@ -101,13 +105,33 @@ def run_mapper(colmap: Any, mapper: MapperName, run: MapperRun, registered: Call
 def _models(colmap: Any, mapper: MapperName, job: SfmJob, progress: Progress, *, lens_held: bool) -> list[Any]:
     title = "global mapping" if mapper == "global" else "mapping"
     title += ", lens held" if lens_held else ""
-    with progress.task(title, len(job.survey.images)) as task, _scratch(job.database.parent) as scratch:
+    with progress.task(title, len(job.survey.images)) as task, scratch_beside(job.database) as scratch:
         threads = chosen_threads(job.options.threads)
         run = MapperRun(job.database, job.images, scratch, threads, job.options.seed, lens_held)
         models = run_mapper(colmap, mapper, run, lambda: task.advance(1))
         if mapper == "global":
             task.advance(len(job.survey.images))
         return models
+
+
+@contextmanager
+def lens_of(colmap: Any, path: Path, params: Mapping[int, Any]) -> Iterator[None]:
+    """Give cameras in a database other parameters for a while."""
+    with colmap.Database.open(path) as database:
+        stated = {camera.camera_id: camera for camera in database.read_all_cameras() if camera.camera_id in params}
+        before = {camera_id: camera.params.copy() for camera_id, camera in stated.items()}
+        _write_params(database, stated, params)
+    try:
+        yield
+    finally:
+        with colmap.Database.open(path) as database:
+            _write_params(database, stated, before)
+
+
+def _write_params(database: Any, cameras: Mapping[int, Any], params: Mapping[int, Any]) -> None:
+    for camera_id, camera in cameras.items():
+        camera.params = params[camera_id]
+        database.update_camera(camera)
 
 
 def triangulate(colmap: Any, model: Any, database: Path, progress: Progress) -> None:
@@ -131,12 +155,12 @@ def _registered(models: list[Any]) -> int:
 
 
 @contextmanager
-def _scratch(folder: Path) -> Iterator[Path]:
+def scratch_beside(database: Path) -> Iterator[Path]:
     """Make an empty folder for COLMAP's own output, and remove it at the end.
 
     The name is fixed, so that the next run removes the folder of a killed one.
     """
-    scratch = folder / "mapping"
+    scratch = database.parent / "mapping"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     try:

@@ -54,7 +54,7 @@ def join_parts(colmap: Any, models: list[Any], survey: Survey) -> tuple[Any, tup
             continue
         moved = anchor.inverse() @ place
         model.transform(colmap.Sim3d(moved.matrix()[:3]))
-        _add(colmap, whole, model)
+        add_part(colmap, whole, model)
         parts.append(Part(new, ""))
     return whole, tuple(parts)
 
@@ -111,26 +111,30 @@ def _with_rotation(rotation: FloatArray, source: FloatArray, target: FloatArray)
     return Similarity(scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0))
 
 
-def _add(colmap: Any, whole: Any, part: Any) -> None:
+def add_part(colmap: Any, whole: Any, part: Any) -> None:
     """Add the photographs and points of a model, in the frame of another one, to that one."""
-    for image_id in sorted(set(part.reg_image_ids()) - set(whole.reg_image_ids())):
-        theirs = part.images[image_id]
-        source = part.frames[theirs.frame_id]
-        if not whole.exists_camera(theirs.camera_id):
-            whole.add_camera(part.cameras[theirs.camera_id])
+    for frame_id in sorted(set(part.reg_frame_ids()) - set(whole.reg_frame_ids())):
+        source = part.frames[frame_id]
+        theirs = [part.images[data_id.id] for data_id in source.data_ids if part.exists_image(data_id.id)]
+        for image in theirs:
+            if not whole.exists_camera(image.camera_id):
+                whole.add_camera(part.cameras[image.camera_id])
+        if not whole.exists_rig(source.rig_id):
             whole.add_rig(part.rigs[source.rig_id])
-        if whole.exists_image(image_id):  # a mapper's model has those that it has registered alone
-            whole.frames[theirs.frame_id].rig_from_world = source.rig_from_world
+        if whole.exists_frame(frame_id):  # a mapper's model has those that it has registered alone
+            whole.frames[frame_id].rig_from_world = source.rig_from_world
         else:
-            frame = colmap.Frame(frame_id=theirs.frame_id, rig_id=source.rig_id)
-            frame.add_data_id(theirs.data_id)
+            frame = colmap.Frame(frame_id=frame_id, rig_id=source.rig_id)
+            for image in theirs:
+                frame.add_data_id(image.data_id)
             frame.rig_from_world = source.rig_from_world
             whole.add_frame(frame)
-            seen = np.array([point.xy for point in theirs.points2D]).reshape(-1, 2)
-            image = colmap.Image(theirs.name, keypoints=seen, camera_id=theirs.camera_id, image_id=image_id)
-            image.frame_id = theirs.frame_id
-            whole.add_image(image)
-        whole.register_frame(theirs.frame_id)
+            for image in theirs:
+                seen = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+                copy = colmap.Image(image.name, keypoints=seen, camera_id=image.camera_id, image_id=image.image_id)
+                copy.frame_id = frame_id
+                whole.add_image(copy)
+        whole.register_frame(frame_id)
     for point in part.points3D.values():
         track = colmap.Track()
         for element in point.track.elements:

@@ -3,15 +3,13 @@
 1. The mapper, with the lens free.
 2. Once more with the lens held, at that of a large sound model, else at what the photographs state: a model of few
    photographs, or of flat ground, finds a lens that fits it alone, and no other photograph fits that.
-3. Learned features for the photographs that stay out, and the mapper again.
-4. Models that stay apart are placed beside the largest by their positions.
+3. Photographs and small models that stay out are joined by their matches with the largest one (`joining.py`).
+4. Learned features for the photographs that stay out, and the mapper again.
+5. Models that stay apart are placed beside the largest by their positions.
 """
 
 import logging
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,9 +18,10 @@ from pipelines.core.progress import Progress
 from pipelines.core.types import IntArray
 from pipelines.sfm.colmap_database import has_added_features, verified_matches
 from pipelines.sfm.features import SfmJob, candidate_pairs
+from pipelines.sfm.joining import Join, join_by_matches
 from pipelines.sfm.learned_weights import missing_for_learned
 from pipelines.sfm.lens_check import lenses_astray
-from pipelines.sfm.mapping import MapperName, map_database
+from pipelines.sfm.mapping import MapperName, lens_of, map_database
 from pipelines.sfm.parts import Part, join_parts
 from pipelines.survey.survey import Survey
 
@@ -32,6 +31,7 @@ _WHOLE = 0.95  # of the photographs: one model of as many needs no further round
 _FEWEST_FOR_LENS = 10  # photographs of a model whose lens counts for others
 _FITS_AS_WELL = 1.25  # reprojection error with the lens held, over that with it free
 _ENOUGH_MATCHES = 100  # verified ones of a pair: learned features add little to these
+_MOST_NAMED = 5
 _MOST_LEARNED_PAIRS = 4000  # hours on two cores
 
 
@@ -61,11 +61,15 @@ def align(colmap: Any, job: SfmJob, progress: Progress) -> Alignment:
         _add_learned(colmap, job, candidate_pairs(job.survey, job.options), progress)
     best = Alignment(*map_database(colmap, job, progress))
     best = _with_lens_held(colmap, job, best, progress)
+    best, joins = _joined_by_matches(colmap, job, best, progress)
     if not _whole(best, job.survey) and job.options.features == "auto" and missing_for_learned() is None:
         pairs = _pairs_to_add(colmap, job, best)
         if len(pairs) and _add_learned(colmap, job, pairs, progress):
             again = Alignment(*map_database(colmap, job, progress, lens_held=best.lens_held), best.lens_held)
-            best = max(best, again, key=_merit)
+            again, joins_again = _joined_by_matches(colmap, job, again, progress)
+            if _merit(again) > _merit(best):
+                best, joins = again, joins_again
+    _tell_of_ties(best, joins)
     if len(best.models) > 1 and best.registered < len(job.survey.images):
         _tell_of_parts(best, len(job.survey.images))
         alone = best.registered  # Joining adds photographs to this very model.
@@ -73,6 +77,19 @@ def align(colmap: Any, job: SfmJob, progress: Progress) -> Alignment:
         _tell_of_joins(parts, alone)
         best = replace(best, models=[largest])
     return best
+
+
+def _joined_by_matches(
+    colmap: Any, job: SfmJob, alignment: Alignment, progress: Progress
+) -> tuple[Alignment, tuple[Join, ...]]:
+    """Return an alignment whose largest model has what its matches tie to it.
+
+    The global mapper's model has too few points for that, and leaves out one photograph of twenty at most.
+    """
+    if not alignment.models or alignment.mapper == "global":
+        return alignment, ()
+    largest, joins = join_by_matches(colmap, job, alignment.models[0], progress)
+    return replace(alignment, models=[largest, *alignment.models[1:]]), joins
 
 
 def _with_lens_held(colmap: Any, job: SfmJob, free: Alignment, progress: Progress) -> Alignment:
@@ -85,7 +102,7 @@ def _with_lens_held(colmap: Any, job: SfmJob, free: Alignment, progress: Progres
     if astray:
         why = "; ".join(f"camera {camera} has {reason}" for camera, reason in astray.items())
         log.info("The model of %d photographs is solved again with the lens held: %s.", free.registered, why)
-    with _lens_of(colmap, job.database, _sound_lens(free, job.survey)):
+    with lens_of(colmap, job.database, _sound_lens(free, job.survey)):
         models, mapper = map_database(colmap, job, progress, lens_held=True)
     held = Alignment(models, mapper, lens_held=True)
     as_many = held.covered() >= free.covered() and held.registered >= free.registered
@@ -116,26 +133,6 @@ def _sound_lens(alignment: Alignment, survey: Survey) -> dict[int, Any]:
     return {}
 
 
-@contextmanager
-def _lens_of(colmap: Any, path: Path, params: Mapping[int, Any]) -> Iterator[None]:
-    """Give cameras in a database other parameters for a while."""
-    with colmap.Database.open(path) as database:
-        stated = {camera.camera_id: camera for camera in database.read_all_cameras() if camera.camera_id in params}
-        before = {camera_id: camera.params.copy() for camera_id, camera in stated.items()}
-        _write_params(database, stated, params)
-    try:
-        yield
-    finally:
-        with colmap.Database.open(path) as database:
-            _write_params(database, stated, before)
-
-
-def _write_params(database: Any, cameras: Mapping[int, Any], params: Mapping[int, Any]) -> None:
-    for camera_id, camera in cameras.items():
-        camera.params = params[camera_id]
-        database.update_camera(camera)
-
-
 def _pairs_to_add(colmap: Any, job: SfmJob, alignment: Alignment) -> IntArray:
     """Return the pairs (P, 2) that learned features may connect: of photographs apart, with few matches so far."""
     apart = set(range(len(job.survey.images))) - {i - 1 for i in alignment.models[0].reg_image_ids()}
@@ -161,6 +158,24 @@ def _add_learned(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress) 
         )  # fmt: skip
         pairs = pairs[np.linspace(0, len(pairs) - 1, _MOST_LEARNED_PAIRS).astype(int)]
     return add_learned(colmap, job, pairs, progress)
+
+
+def _tell_of_ties(alignment: Alignment, joins: tuple[Join, ...]) -> None:
+    if not joins:
+        return
+    images = alignment.models[0].images
+    count = sum(len(join.images) for join in joins)
+    each = "; ".join(
+        f"{', '.join(images[image_id].name for image_id in join.images[:_MOST_NAMED])}"
+        f"{' …' if len(join.images) > _MOST_NAMED else ''}: {join.tie.matches} matches in {join.tie.pairs} pairs, "
+        f"{join.tie.points} of them points of the others, σ {100 * join.tie.sigma:.2g} %"
+        for join in joins
+    )
+    log.warning(
+        "%d photographs are joined to the others by few points, where the mapper leaves them out: check them. "
+        "Their σ is that of their place beside the others, of the distance to the ground. %s.",
+        count, each, extra={"code": "joined-by-matches"},
+    )  # fmt: skip
 
 
 def _tell_of_parts(alignment: Alignment, photographs: int) -> None:

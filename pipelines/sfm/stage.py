@@ -16,9 +16,9 @@ from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeo
 from pipelines.core.plan import photograph_folder
 from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import Progress
-from pipelines.core.stages import COMMON_POINTS, SURVEY
+from pipelines.core.stages import COMMON_POINTS, RIG_MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.formats.colmap import quiet_colmap
+from pipelines.formats.colmap import load_reconstruction, quiet_colmap
 from pipelines.sfm.dates import EarlierDate, tie_to_earlier
 from pipelines.sfm.features import SfmJob, masks_beside
 from pipelines.sfm.learned_weights import learned_remedy
@@ -38,7 +38,7 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
         DegenerateGeometryError: fewer than three photographs are registered.
     """
     path = stage.workspace.path(SURVEY)
-    survey, engine = load_json(Survey, path), reconstructor_of(options)
+    survey, engine = surveyed(path, options), reconstructor_of(options)
     if options.earlier is not None:  # What cannot be tied is refused before the work begins.
         if options.earlier.resolve() == stage.workspace.root.resolve():
             raise InputError(
@@ -71,13 +71,15 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
 
     Among the arguments are paths of `survey`, `images` and `out`, and the `options` of the stage.
     """
-    survey, database = load_json(Survey, Path(arguments["survey"])), Path(arguments["out"]) / "database.db"
     options = SfmOptions.model_validate(arguments["options"])
+    survey, database = surveyed(Path(arguments["survey"]), options), Path(arguments["out"]) / "database.db"
     job = SfmJob(survey, Path(arguments["images"]), database, options, masks_beside(arguments["survey"], survey))
-    if job.sparse.exists():
-        shutil.rmtree(job.sparse)
+    for folder in (job.sparse, job.sparse.with_name(Path(RIG_MODEL).name)):
+        shutil.rmtree(folder, ignore_errors=True)
     model = reconstructor_of(options).reconstruct(job, progress)
     summary = _summarise(model, survey)
+    if survey.companions and options.import_model is None:
+        summary = _summarise_rig(load_reconstruction(job.sparse), model, survey)
     warnings = list(summary.warnings)
     if options.earlier is not None:
         if not database.is_file():
@@ -91,6 +93,23 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
         with quiet_colmap() as colmap:
             warnings += unregistered(colmap, database, model, learned_remedy(options.features))
     return {**vars(summary), "warnings": [warning.model_dump() for warning in warnings]}
+
+
+def surveyed(path: Path, options: SfmOptions) -> Survey:
+    """Return the survey, and among its images those of a rig's other lenses; without them for an imported model."""
+    survey = load_json(Survey, path)
+    return survey if options.import_model is not None else survey.with_companions()
+
+
+def _summarise_rig(reference: Any, model: Any, survey: Survey) -> Summary:
+    """Return the summary of the reference lens's photographs, with the number of all."""
+    images = tuple(image for image in survey.images if image.name not in {each.name for each in survey.companions})
+    summary = _summarise(reference, survey.model_copy(update={"images": images}))
+    names = {model.images[image_id].name for image_id in model.reg_image_ids()}
+    beside = sum(each.name in names for each in survey.companions)
+    values = {**summary.values, "companions": len(survey.companions), "companions_registered": beside}
+    figure = f"{summary.key_figure}, and {beside} of {len(survey.companions)} of the rig's other lenses"
+    return Summary(figure, values, summary.warnings)
 
 
 def _summarise(model: Any, survey: Survey) -> Summary:

@@ -290,6 +290,20 @@ class SurveyImage(Product):
     sharpness: float | None = None
 
 
+class Companion(Product):
+    """Photograph of another lens of a rig, exposed together with a photograph of the survey, `beside`.
+
+    Its place follows from that of the photograph beside it: it has no measured pose, and no part in training.
+    `stated_quat_xyzw` is the rotation of the lens, lens ← lens of the photograph beside it, if somebody stated it.
+    """
+
+    name: ImageName
+    camera_id: int
+    sha256: str
+    beside: ImageName
+    stated_quat_xyzw: Rotation | None = None
+
+
 class Mark(Product):
     """Image coordinates of a surveyed point: pixels of the full image, centre of the top-left pixel (0.5, 0.5)."""
 
@@ -353,6 +367,7 @@ class Survey(Product):
         transformations: ways of the input's coordinates to WGS84, where their CRS is another.
         sigma_datum_m: σ east, north, up that all control points share, because their CRS is tied to WGS84 no
             better; no adjustment reveals it, and all absolute σ of a result with control points include it.
+        companions: photographs of the other lenses of a rig.
         check_points: points that enter no solution.
         assumptions: decisions that `ingest` made where the input states nothing.
         cautions: limits of every result of the survey.
@@ -370,6 +385,7 @@ class Survey(Product):
     image_dir: Annotated[str, AfterValidator(image_dir)]
     cameras: tuple[CameraPrior, ...]
     images: tuple[SurveyImage, ...]
+    companions: tuple[Companion, ...] = ()
     sessions: tuple[FixSession, ...] = ()
     transformations: tuple[UsedTransformation, ...] = ()
     sigma_datum_m: Vector3 = (0.0, 0.0, 0.0)
@@ -397,7 +413,7 @@ class Survey(Product):
     @model_validator(mode="after")
     def _belongs_together(self) -> Survey:
         names = {
-            "images": [image.name for image in self.images],
+            "images": [image.name for image in (*self.images, *self.companions)],
             "control_points": [point.name for point in self.control_points],
             "check_points": [point.name for point in self.check_points],
             "unmarked_points": [point.name for point in self.unmarked_points],
@@ -407,9 +423,14 @@ class Survey(Product):
             if len(set(of_field)) != len(of_field):
                 raise ValueError(f"{field}: two have the same name")
         cameras = {camera.camera_id for camera in self.cameras}
-        lost = next((image for image in self.images if image.camera_id not in cameras), None)
+        everything = (*self.images, *self.companions)
+        lost = next((image for image in everything if image.camera_id not in cameras), None)
         if lost is not None:
             raise ValueError(f"images: {lost.name} has camera {lost.camera_id}, which is not among the cameras")
+        shown = set(names["images"][: len(self.images)])
+        alone = next((each for each in self.companions if each.beside not in shown), None)
+        if alone is not None:
+            raise ValueError(f"companions: {alone.name} is beside {alone.beside}, which is not among the images")
         fixed = [(image, image.fix) for image in self.images if self.sessions and image.fix is not None]
         stray = next(((image, fix) for image, fix in fixed if fix.session >= len(self.sessions)), None)
         if stray is not None:
@@ -428,6 +449,17 @@ class Survey(Product):
                 "with positions or control points.",
             )
         return self.origin
+
+    def with_companions(self) -> Survey:
+        """Return the survey whose images are also the companions, with the measured poses of those beside them."""
+        beside = {image.name: image for image in self.images}
+        more = (
+            beside[each.beside].model_copy(
+                update={"name": each.name, "camera_id": each.camera_id, "sha256": each.sha256, "mask_sha256": ""}
+            )
+            for each in self.companions
+        )
+        return self.model_copy(update={"images": (*self.images, *more)})
 
     @property
     def largest_photograph_px(self) -> tuple[int, int]:
