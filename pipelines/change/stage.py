@@ -28,10 +28,11 @@ from pipelines.change.grid import CommonGrid, EpochRasters, Window, epoch_raster
 from pipelines.change.options import ChangeOptions
 from pipelines.change.page import Compared, change_page
 from pipelines.change.regions import Parts, find_regions, reach_of
-from pipelines.change.tied import Tied, tied_by
+from pipelines.change.tied import Tied, contradicted, tied_by
 from pipelines.core.errors import InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, save_json, union
+from pipelines.core.sentences import listed
 from pipelines.core.stages import CHANGE_PAGE
 from pipelines.core.staleness import status
 from pipelines.core.types import vector3
@@ -117,7 +118,8 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     remove(parts.folder)
     cautions = tuple(one.cautions for one in epochs)
     stale = tuple(remark for one in workspaces for remark in _stale_rasters(one))
-    summary = _summary(change, (*stale, *solved_again), union(*cautions))
+    doubted = () if tied is None else _doubted(contradicted(tied, found.regions, found.polygons, grid.crs))
+    summary = _summary(change, (*stale, *solved_again, *doubted), union(*cautions))
     compared = Compared(stage.out, change, found.polygons, grid, workspaces, tied)
     page = change_page(compared, summary.warnings, cautions, stage.progress)
     replace_text(stage.out / Path(CHANGE_PAGE).name, render_page(page, _ROOM))
@@ -265,6 +267,17 @@ def _write_significant(folder: Path, parts: Parts, sign: NDArray[np.int8]) -> No
 def _write_mosaic(folder: Path, parts: Parts, name: str) -> None:
     places = [(parts.path(name, window), window.column, window.row) for window in parts.grid.windows()]
     write_mosaic(folder / f"{name}.tif", places, parts.grid.frame, _KINDS[name], {})
+
+
+def _doubted(names: list[str]) -> tuple[Remark, ...]:
+    """Return the warning of regions that their own points in common contradict; none without."""
+    if not names:
+        return ()
+    sentence = (
+        f"In {listed(names)}, points in common lie where they lay at the other date, although the surfaces differ: "
+        "one of both is wrong there. Compare the photographs before you count the volume."
+    )
+    return (Remark(code="region-contradicted", sentence=sentence),)
 
 
 def _write_common(folder: Path, tied: Tied) -> None:

@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import shapely
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid
 from pipelines.adjust.relative import Relative, Solved, relative
@@ -22,10 +24,12 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import lla_from_enu
-from pipelines.survey.change_report import CommonDates
+from pipelines.survey.change_report import ChangedRegion, CommonDates
 from pipelines.survey.common_points import CommonPoints, solution_hash
 
 _MOST_DATES = 30
+_LEAST_INSIDE = 3  # points in common in a region, of which one may be wrong
+_STILL = 0.5  # of the mean change of a region: points that moved less have not moved with it
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,23 @@ class Tied:
     def missed_m(self) -> FloatArray:
         """Later minus earlier place (J, 3) of the points, east, north, up of their step."""
         return np.concatenate([step.relative.missed_m for step in self.steps])
+
+
+def contradicted(tied: Tied, regions: Sequence[ChangedRegion], polygons: Sequence[Any], crs: PointCrs) -> list[str]:
+    """Return the names of found regions in which points in common lie where they lay at the other date.
+
+    Photographs show the same marks in the same places then: one of both surfaces is wrong. Polygons are in the plan
+    of the CRS.
+    """
+    plan, used, up_m = crs.xyz_from_lla(tied.lla())[:, :2], tied.used, tied.missed_m[:, 2]
+    found = []
+    for region, polygon in zip(regions, polygons, strict=True):
+        inside = used & shapely.contains_xy(polygon, plan[:, 0], plan[:, 1])
+        if not region.name.startswith("R") or inside.sum() < _LEAST_INSIDE:
+            continue
+        if abs(float(np.median(up_m[inside]))) < _STILL * abs(region.net_m3) / region.area_m2:
+            found.append(region.name)
+    return found
 
 
 def tied_by(

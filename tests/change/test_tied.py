@@ -7,19 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
+import shapely.affinity
 
 from pipelines.adjust.relative import Solved
 from pipelines.change.datum import load_epoch
 from pipelines.change.options import ChangeOptions
 from pipelines.change.stage import run
-from pipelines.change.tied import tied_by
+from pipelines.change.tied import contradicted, tied_by
 from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import COMMON_POINTS, MODEL, SIM3
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.geotiff import read_cells
 from pipelines.geodesy.crs import parse_crs
 from pipelines.survey.adjustment import InitialSimilarity
-from pipelines.survey.change_report import Change
+from pipelines.survey.change_report import Change, ChangedRegion
 from pipelines.survey.common_points import CommonPoints, solution_hash
 from pipelines.survey.trained_model import TrainedModel
 from tests.change_pairs import TownPair, town_pair
@@ -110,6 +112,27 @@ def test_tied_epochs_need_no_registration(pair: TownPair, tmp_path: Path) -> Non
     assert sum(place["properties"]["used"] for place in places) == change.common.used
     assert "<circle" in (tmp_path / "out/change.html").read_text("utf-8")
     assert summary.values["common"] == change.common.model_dump()
+
+
+def test_points_that_stand_still_contradict_a_region(tmp_path: Path) -> None:
+    spring, autumn = (trained_workspace(tmp_path / name)[1] for name in ("spring", "autumn"))
+    tie(autumn, spring)
+    tied, _ = tied_by((load_epoch(spring), load_epoch(autumn)), (spring, autumn))
+    assert tied is not None
+    crs = parse_crs("EPSG:32632")
+    plan = crs.xyz_from_lla(tied.lla())[:, :2]
+    around = shapely.MultiPoint(plan).convex_hull.buffer(1.0)
+    aside = shapely.affinity.translate(around, xoff=1000.0)
+    region = ChangedRegion(
+        name="R1", area_m2=100.0, cut_m3=0.0, fill_m3=40.0, net_m3=40.0, sigma_m3=1.0, lowest_m=0.0, highest_m=0.5
+    )
+    flat = region.model_copy(update={"name": "R2", "fill_m3": 0.01, "net_m3": 0.01})
+    given = region.model_copy(update={"name": "P1"})
+    regions, polygons = (region, region.model_copy(update={"name": "R3"}), given), (around, aside, around)
+    assert contradicted(tied, regions, polygons, crs) == ["R1"]
+    # The points' own noise, of centimetres, says nothing of a change of a tenth of a millimetre.
+    up = abs(float(np.median(tied.missed_m[tied.used, 2])))
+    assert contradicted(tied, (flat,), (around,), crs) == (["R2"] if up < 5e-5 else [])
 
 
 def test_either_order_is_recognised_and_another_solution_is_not(pair: TownPair, tmp_path: Path) -> None:
