@@ -177,7 +177,8 @@ def depth_maps_of(flight: RecordedFlight, given: dict[str, Any], folder: Path, c
         hits = rays.first_hits(np.array(center), direction)
         true_m = rays.exact_distance(np.array(center), direction, hits)
         depth = np.where(hits.triangle == MISS, 0.0, true_m + rng.normal(0, 0.02, len(true_m))) / length
-        counts = np.clip(np.rint(np.nan_to_num(depth) / DEPTH_STEP_M), 0, 65534).astype(np.uint16)
+        counts = np.rint(np.nan_to_num(depth) / DEPTH_STEP_M)
+        counts = np.where((counts > 0) & (counts < 65535), counts, 0).astype(np.uint16)  # the range of the camera
         cv2.imwrite(str((draft / name).with_suffix(".png")), counts.reshape(camera.height, camera.width))
     draft.rename(folder)
     return folder

@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 # georef.toml, or with the stage's own command.
 _EFFORT = ("preset", "iterations", "max_image_size", "max_gaussians", "crop_size", "blocks")
 _LIDAR = (
-    *("lidar", "lidar_crs", "lidar_vertical", "lidar_offset"),
+    *("lidar", "lidar_crs", "lidar_vertical", "lidar_offset", "lidar_up"),
     *("lidar_trajectory", "lidar_sigma", "lidar_register"),
     *("depth_unit", "depth_along", "depth_camera"),
 )

@@ -7,7 +7,7 @@ from pydantic import Field
 from pipelines.core.options import ExtraMarker, InputPath
 from pipelines.geodesy.vertical import Vertical
 from pipelines.splat.rasterizer.choice import Backend
-from pipelines.survey.options import CloudPath, FilledAreaOptions, MapOffset
+from pipelines.survey.options import CloudPath, FilledAreaOptions, MapOffset, UpAxis
 from pipelines.survey.report_parts import Alignment
 
 
@@ -47,6 +47,11 @@ class EvaluateOptions(FilledAreaOptions):
         None,
         description="Easting, northing and height that are added to the coordinates of the reference's files, in "
         "their unit. It overrules what files beside a mesh state.",
+    )
+    reference_up: UpAxis | None = Field(
+        None,
+        description="Axis of a mesh's file that points up. Without it: y of GLB, as its standard says, z of "
+        "PLY and OBJ.",
     )
     reference_crs: str | None = Field(
         None,

@@ -108,9 +108,8 @@ class _Scene:
         if not on_map:
             place = place @ _Z_UP_FROM_Y_UP.T
         mesh = mesh_of(self.path, place, (corners.ravel(), np.full(len(corners), 3, np.int64)))
-        return replace(
-            mesh, offset=center, crs="EPSG:4978" if center is not None and _is_earth_centred(center) else ""
-        )
+        crs = "" if center is None or on_map else "EPSG:4978"
+        return replace(mesh, turned=not on_map, offset=center, crs=crs)
 
     def _center(self) -> FloatArray | None:
         """Return the centre (3,) of CESIUM_RTC, None without; a ValueError: no three finite numbers."""

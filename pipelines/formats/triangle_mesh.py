@@ -29,16 +29,25 @@ _MOST_CORNERS = 255
 class TriangleMesh:
     """Triangles (F, 3) of vertices (V, 3), the third axis up.
 
-    `states_axes`: the format says which axis is up. `offset` (3,) and `crs` are what the file itself says of its
-    place, None and empty: nothing.
+    `states_axes`: the format says which axis is up. `turned`: it was the second one, and the vertices are x, −z, y
+    of the file. `offset` (3,) and `crs` are what the file itself says of its place, None and empty: nothing.
     """
 
     path: Path
     vertices: FloatArray
     faces: IntArray
     states_axes: bool = True
+    turned: bool = False
     offset: FloatArray | None = None
     crs: str = ""
+
+    def with_up(self, axis: str) -> TriangleMesh:
+        """Return the mesh with another axis of the file up: `y` or `z`."""
+        if (axis == "y") == self.turned:
+            return replace(self, states_axes=True)
+        x, y, z = self.vertices.T
+        vertices = np.column_stack([x, -z, y] if axis == "y" else [x, z, -y])
+        return replace(self, vertices=vertices, states_axes=True, turned=axis == "y")
 
 
 def has_faces(path: Path) -> bool:

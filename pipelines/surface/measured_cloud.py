@@ -377,6 +377,8 @@ def _opened(path: Path, stated: CloudCrs) -> CloudFile | MeshFile:
 
 
 def _placed_mesh(mesh: TriangleMesh, stated: CloudCrs) -> MeshFile:
+    if stated.up is not None:
+        mesh = mesh.with_up(stated.up)
     place = placed(
         mesh, crs_stated=stated.crs is not None, offset_stated=stated.offset is not None, flag=stated.flag
     )
@@ -384,7 +386,7 @@ def _placed_mesh(mesh: TriangleMesh, stated: CloudCrs) -> MeshFile:
     if not mesh.states_axes:
         sentence = (
             f"{mesh.path.name}: its axes were taken as easting, northing and height, in this order: an OBJ does "
-            "not say which axis is up."
+            f"not say which axis is up. {stated.flag}-up states it."
         )
         remarks.append(Remark(code=f"{stated.flag.removeprefix('--')}-axes", sentence=sentence))
     return MeshFile(replace(mesh, vertices=place.position), place.crs, tuple(remarks))

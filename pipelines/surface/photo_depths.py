@@ -68,15 +68,9 @@ class DepthRays:
 
 
 def holds_depth_maps(path: Path) -> bool:
-    """Return whether a file or folder is of depth maps; an InputError: of depth maps and of clouds."""
-    found = suffixes_in(path) & (CLOUD_SUFFIXES | DEPTH_SUFFIXES)
-    maps, clouds = found & DEPTH_SUFFIXES, found & CLOUD_SUFFIXES
-    if maps and clouds and not clouds & {".obj", ".glb"}:  # textures lie beside meshes
-        message = (
-            f"The folder holds depth maps ({', '.join(sorted(maps))}) and clouds ({', '.join(sorted(clouds))})."
-        )
-        raise InputError("kinds-mixed", f"{message} Give one of them.", path=path, field="--lidar")
-    return bool(maps) and not clouds
+    """Return whether a path is of depth maps: pictures beside clouds and meshes are previews and textures."""
+    found = suffixes_in(path)
+    return bool(found & DEPTH_SUFFIXES) and not found & CLOUD_SUFFIXES
 
 
 class PhotoDepths:

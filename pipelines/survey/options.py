@@ -54,6 +54,7 @@ def _offset(numbers: Vector3) -> Vector3:
     return numbers
 
 
+UpAxis = Literal["y", "z"]
 MapOffset = Annotated[Vector3, from_text(triple_of), AfterValidator(_offset), WRITTEN]
 
 
@@ -66,6 +67,7 @@ class CloudCrs:
     # Option that named the clouds, for errors: `--lidar` has `--lidar-crs` and `--lidar-vertical`
     flag: str = "--lidar"
     offset: Vector3 | None = None  # added to the coordinates of the files, in their unit
+    up: UpAxis | None = None  # third or second axis of meshes; None: as their format says
 
 
 class CrsOptions(StageOptions):

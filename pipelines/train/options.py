@@ -12,7 +12,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.options import WRITTEN, InputPath, StageOptions, flag_name, from_text
 from pipelines.geodesy.vertical import Vertical
 from pipelines.splat.rasterizer.choice import Backend
-from pipelines.survey.options import AreaOptions, MapOffset, MeasuredPath
+from pipelines.survey.options import AreaOptions, MapOffset, MeasuredPath, UpAxis
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ DepthCamera = Annotated[
 
 
 # Options that belong to one kind of measured geometry.
-_OF_CLOUDS = ("lidar_crs", "lidar_vertical", "lidar_offset", "lidar_trajectory", "lidar_register")
+_OF_CLOUDS = ("lidar_crs", "lidar_vertical", "lidar_offset", "lidar_up", "lidar_trajectory", "lidar_register")
 _OF_DEPTHS = ("depth_unit", "depth_along", "depth_camera")
 _OF_LIDAR = (*_OF_CLOUDS, *_OF_DEPTHS)
 
@@ -106,6 +106,11 @@ class LidarOptions(StageOptions):
         None,
         description="Easting, northing and height that are added to the coordinates of the LiDAR's files, in their "
         "unit. It overrules what files beside a mesh state.",
+    )
+    lidar_up: UpAxis | None = Field(
+        None,
+        description="Axis of a mesh's file that points up. Without it: y of GLB, as its standard says, z of "
+        "PLY and OBJ.",
     )
     lidar_crs: str | None = Field(None, description="CRS of the LiDAR. It overrules what its files state.")
     lidar_vertical: Vertical | None = Field(

@@ -139,7 +139,7 @@ def measured_files(options: TrainOptions, scene: Scene) -> MeasuredFiles | None:
 
 
 def _stated_crs(options: TrainOptions) -> CloudCrs:
-    return CloudCrs(options.lidar_crs, options.lidar_vertical, offset=options.lidar_offset)
+    return CloudCrs(options.lidar_crs, options.lidar_vertical, offset=options.lidar_offset, up=options.lidar_up)
 
 
 def _within_memory(options: TrainOptions, images: ImageCache, free_bytes: int | None) -> TrainOptions:

@@ -25,7 +25,7 @@ from pipelines.surface import measured_cloud
 from pipelines.surface.lidar_cloud import LidarCloud, planes_of
 from pipelines.surface.measured_cloud import CloudReader, Thinning, read_thinned
 from pipelines.surface.registration import registration
-from pipelines.survey.options import CloudCrs
+from pipelines.survey.options import CloudCrs, UpAxis
 from pipelines.train.lidar_surface import LidarPlanes, verdict
 from tests.geometry_files import ScanFile, distance_to, mesh_of, write_e57
 from tests.refusals import codes, numbers, refused
@@ -262,6 +262,19 @@ def test_a_glb_counts_from_the_centre_that_it_states(tmp_path: Path, geocentric:
     found = np.concatenate([chunk.position_in_geo for chunk in files.chunks(ORIGIN)])
     xyz = found if geocentric else in_crs(found) - shift
     assert distance_to(FLAT, xyz[::97]).max() < 2e-4
+    np.testing.assert_allclose(xyz.max(axis=0), [3, 2, 0.4], atol=0.03)
+
+
+@pytest.mark.parametrize(("kind", "up"), [("obj", "y"), ("ply", "y"), ("glb", "z")])
+def test_the_user_states_the_axis_of_a_mesh_that_is_up(tmp_path: Path, kind: str, up: UpAxis) -> None:
+    """As Blender exports an OBJ, and as programs for maps write a GLB."""
+    shift, mesh = in_crs(np.zeros((1, 3)))[0].round(), FLAT.copy()
+    if up == "y":
+        mesh.vertices = mesh.vertices[:, [0, 2, 1]] * [1, 1, -1]
+    mesh.export(tmp_path / f"m.{kind}")
+    files = CloudReader(tmp_path / f"m.{kind}", CloudCrs(crs=UTM, offset=tuple(shift), up=up))
+    xyz = in_crs(np.concatenate([chunk.position_in_geo for chunk in files.chunks(ORIGIN)])) - shift
+    assert distance_to(FLAT, xyz[::97]).max() < 2e-4 and "lidar-axes" not in codes(files.assumptions)
     np.testing.assert_allclose(xyz.max(axis=0), [3, 2, 0.4], atol=0.03)
 
 
