@@ -168,6 +168,7 @@ def _adjust(colmap: Any, model: Any, adjustment: Any) -> None:
     bundle = colmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         bundle.add_image(image_id)
+    hold_lenses_in_place(bundle, model)
     bundle.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     summary = colmap.create_default_bundle_adjuster(adjustment, bundle, model).solve()
     if not summary.is_solution_usable():
@@ -175,6 +176,14 @@ def _adjust(colmap: Any, model: Any, adjustment: Any) -> None:
             "bundle-not-converged",
             f"The last bundle adjustment found no solution: {summary.brief_report()}",
         )
+
+
+def hold_lenses_in_place(bundle: Any, model: Any) -> None:
+    """Hold the lenses of rigs that are exactly at the place of the reference lens, in an adjustment (`rigs.py`)."""
+    for rig in model.rigs.values():
+        for sensor, pose in rig.non_ref_sensors.items():
+            if pose is not None and not np.any(pose.translation):
+                bundle.set_constant_sensor_from_rig_pose(sensor)
 
 
 def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:

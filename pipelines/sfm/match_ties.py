@@ -57,7 +57,7 @@ class Side:
     @property
     def ray(self) -> FloatArray:
         """Unit vectors (M, 3) in the model's frame."""
-        return np.einsum("mji,mj->mi", self.cam_from_model, self.bearing)
+        return np.asarray(np.einsum("mji,mj->mi", self.cam_from_model, self.bearing))
 
     @property
     def focal_px(self) -> FloatArray:
@@ -129,7 +129,7 @@ def tie(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed: int = 0)
     Args:
         has_scale: the part has two photographs or more, so that its scale is to be found.
     """
-    sound = np.isfinite(model.bearing).all(axis=1) & np.isfinite(part.bearing).all(axis=1)
+    sound = np.isfinite(np.concatenate([model.bearing, part.bearing], axis=1)).all(axis=1)
     model, part = model.of(sound), part.of(sound)
     if len(model.image) < _FEWEST_MATCHES:
         return f"{len(model.image)} matches tie it to the model, and {_FEWEST_MATCHES} are needed"
@@ -205,7 +205,7 @@ def _sigma_px(model: Side, part: Side, place: Similarity) -> FloatArray:
     size = np.abs(_equations(model, part, place))
     kinds = [size[:, :2], size[:, 2:4], size[:, 4:]]
     sigma = [NORMAL_MAD * np.nanmedian(kind) if np.isfinite(kind).any() else _LEAST_SIGMA_PX for kind in kinds]
-    return np.maximum(np.repeat(sigma, [2, 2, 1]), _LEAST_SIGMA_PX)
+    return np.asarray(np.maximum(np.repeat(sigma, [2, 2, 1]), _LEAST_SIGMA_PX))
 
 
 def _refined(

@@ -23,8 +23,9 @@ from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress
 from pipelines.core.types import FloatArray
 from pipelines.formats.colmap import flatten, reconstruction_of
-from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
+from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw
 from pipelines.robust.statistics import CAUCHY_95
+from pipelines.sfm.adjustment import alignment_with, hold_lenses_in_place
 from pipelines.sfm.colmap_database import copy_database, remove_database
 from pipelines.sfm.features import SfmJob
 from pipelines.survey.survey import Companion, Survey
@@ -33,6 +34,8 @@ log = logging.getLogger(__name__)
 
 _FEWEST_INSTANTS = 2  # that show a lens and the reference
 _FEWEST_POINTS = 30  # that both show
+_WIDEST_BODY_M = 0.25  # between two lenses of one body
+_FEWEST_FIXES = 4  # that tell metres
 _LOSS_PX = 1.0
 _MOST_STEPS = 50
 _STATED_DIFFERS_DEG = 2.0
@@ -65,6 +68,9 @@ def with_rigs(colmap: Any, job: SfmJob, model: Any, *, lens_held: bool, progress
             _write_rigs(colmap, draft, constrained, job.survey, lenses)
             _adjust(colmap, job, constrained, lens_held=lens_held)
             _triangulate(colmap, job, draft, constrained, sorted(set(constrained.reg_image_ids()) - before))
+            references = {key: lens.reference for key, lens in lenses.items()}
+            if hold_in_body(colmap, constrained, job.survey, references):
+                _adjust(colmap, job, constrained, lens_held=lens_held)
             task.advance()
     finally:
         remove_database(draft)
@@ -264,10 +270,65 @@ def _write_rigs(colmap: Any, database: Path, model: Any, survey: Survey, lenses:
             opened.write_frame(frame, use_frame_id=True)
 
 
+def hold_in_body(colmap: Any, model: Any, survey: Survey, references: Mapping[int, int]) -> bool:
+    """Put lenses that were solved outside of their body to the place of the reference lens; whether any was.
+
+    `references` has the reference's camera of each camera. Adjustments hold these lenses (`hold_lenses_in_place`).
+
+    From far above, a lens that moves along its axis differs from one of another focal length by the relief alone:
+    photographs of flat ground may leave decimetres open, where the lenses of one body are centimetres apart.
+    Rotation and focal length follow, so that what lies at the median distance is seen where it was.
+    """
+    fixes = {image.name: image.fix for image in survey.images}
+    seen = [model.images[key] for key in sorted(model.reg_image_ids())]
+    placed = [(image.projection_center(), fix) for image in seen if (fix := fixes[image.name]) is not None]
+    if len(placed) < _FEWEST_FIXES:
+        return False
+    centers, positions = np.array([at for at, _ in placed]), np.array([fix.position_in_geo for _, fix in placed])
+    metres = alignment_with(centers, positions)[0].scale
+    prior = {each.camera_id: each for each in survey.cameras}
+    moved = False
+    for key, reference in references.items():
+        one, other = prior[key], prior[reference]
+        rig, camera = model.rigs[reference], model.cameras[key]
+        pose = rig.sensor_from_rig(camera.sensor_id).matrix()
+        offset_m = metres * float(np.linalg.norm(pose[:, 3]))
+        same_body = one.serial == other.serial != "" and one.make_model == other.make_model
+        if not same_body or offset_m <= _WIDEST_BODY_M:
+            continue
+        distance = _median_distance(model, key)
+        x, y, z = pose[:, 3] / distance
+        turned = exp_so3(np.array([-y, x, 0.0])) @ pose[:, :3]
+        rig.set_sensor_from_rig(camera.sensor_id, colmap.Rigid3d(colmap.Rotation3d(turned), np.zeros(3)))
+        params = np.array(camera.params)
+        params[camera.focal_length_idxs()] *= 1 - z
+        camera.params = params
+        log.info(
+            "assumed: the lens of camera %d is at the place of the reference lens of the same body; the "
+            "photographs would put it %.2f m away, which they do not determine.",
+            key, offset_m,
+        )  # fmt: skip
+        moved = True
+    return moved
+
+
+def _median_distance(model: Any, camera_id: int) -> float:
+    """Return the median distance of the points that a camera's photographs show, along their axes."""
+    depth = [
+        image.cam_from_world().matrix()[2] @ [*model.points3D[point.point3D_id].xyz, 1.0]
+        for image in model.images.values()
+        if image.camera_id == camera_id and image.has_pose
+        for point in image.points2D
+        if point.has_point3D()
+    ]
+    return float(np.median(depth))
+
+
 def _adjust(colmap: Any, job: SfmJob, model: Any, *, lens_held: bool) -> None:
     bundle = colmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         bundle.add_image(image_id)
+    hold_lenses_in_place(bundle, model)
     bundle.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     adjustment = colmap.BundleAdjustmentOptions()
     adjustment.print_summary = False

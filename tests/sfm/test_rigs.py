@@ -15,8 +15,8 @@ from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import umeyama
 from pipelines.sfm.colmap_reconstruction import map_matches
 from pipelines.sfm.features import SfmJob
-from pipelines.sfm.rigs import reference_alone
-from pipelines.survey.survey import Companion
+from pipelines.sfm.rigs import hold_in_body, reference_alone
+from pipelines.survey.survey import Companion, Fix, Survey
 from tests.refusals import logged_codes
 from tests.sfm_truth import Views, matched_views, survey_of_views
 
@@ -88,6 +88,27 @@ def offsets_in_rig(model: Any, center: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm((placed - placed[:, :1]) - (center - center[:, :1]), axis=2)[:, 1:])
 
 
+def _is_put_into_its_body(model: Any, survey: Survey, center: FloatArray) -> None:
+    """Of lenses of one body, one cannot be half a metre away: at the reference's place it sees the same ground."""
+    cameras = tuple(prior.model_copy(update={"serial": "7", "make_model": "M"}) for prior in survey.cameras)
+    images = []
+    for image in survey.images:
+        k, lens = map(int, image.name[:-4].split("_"))
+        covariance = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+        x, y, z = center[k, lens].tolist()
+        fix = Fix(position_in_geo=(x, y, z), cov_in_geo=covariance, source="csv", sigma_source="file")
+        images.append(image.model_copy(update={"fix": fix}))
+    held, references = type(model)(model), dict.fromkeys((2, 3, 4), 1)
+    assert not hold_in_body(pycolmap, held, survey, references)
+    survey = survey.model_copy(update={"cameras": cameras, "images": tuple(images)})
+    assert hold_in_body(pycolmap, held, survey, references)
+    place = {sensor.id: pose.translation for sensor, pose in held.rigs[1].non_ref_sensors.items()}
+    assert [bool(np.any(place[key])) for key in (2, 3, 4)] == [True, True, False]
+    # 0.5 m of 60 m are 4.5 px, which rotation and focal length take; the relief of 4 m leaves 0.3 px.
+    held.update_point_3d_errors()
+    assert held.compute_mean_reprojection_error() < 0.3
+
+
 def test_the_lenses_of_an_instant_keep_their_places(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """At 60 m, where a pixel is 11 cm; the rig places the photograph that matches none."""
     job, center = scene(tmp_path)
@@ -98,6 +119,7 @@ def test_the_lenses_of_an_instant_keep_their_places(tmp_path: Path, caplog: pyte
     print(error_m.max(axis=0))
     assert error_m.max() < 0.02
     assert not logged_codes(caplog)
+    _is_put_into_its_body(model, job.survey, center)
     alone = reference_alone(model, job.survey)
     assert sorted(alone.images[key].name for key in alone.reg_image_ids()) == [f"{k:02d}_0.tif" for k in range(12)]
     assert alone.is_valid()
