@@ -78,6 +78,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "PIL": ("pipelines.formats.exif", "pipelines.formats.exif_writer"),
     "kornia": ("pipelines.sfm.learned_features",),
     "laspy": ("pipelines.formats",),
+    "copclib": ("pipelines.formats.copc",),
     "pillow_heif": ("pipelines.formats.heif",),
     "py4dgeo": ("pipelines.surface.m3c2",),
     "plyfile": ("pipelines.formats",),

@@ -28,28 +28,14 @@ from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.scene import photographs
 from pipelines.survey.trained_survey import load_trained
 from pipelines.view.pictures import Painter, Photographs, ViewerCamera, Wanted, frame_of
-from tests.browser.chromium import LIBRARIES, Library, chromium, served
+from tests.browser.chromium import chromium, served
 
-LIBRARIES["Three"] = Library(
-    "three",
-    "0.180.0",
-    "a3eab2700319ae1f93b04d351aa594c5420a47500bd12f29abbcc3918390c3c1"
-    "aa7d7f1bf15a022985281db8625f98feee1afc5ecb870d553afa09102502a0f7",
-    ".",
-)
-LIBRARIES["Spark"] = Library(
-    "@sparkjsdev/spark",
-    "2.2.0",
-    "c1fe45d980263d79e39b6d3f3205d87abf454135f3d89382a34e47c31164683e"
-    "c6ba4f6b1d53c8c1d27a7ead2817d304d2178cbd88fe4f14ba0d3aee72fcba28",
-    "dist",
-)
 _PAGE = """<!doctype html><link rel="icon" href="data:,"><canvas id="canvas"></canvas>
 <script type="importmap">{"imports": {"three": "./Three/build/three.module.js",
     "three/addons/": "./Three/examples/jsm/"}}</script>
 <script type="module">
 import * as THREE from "three";
-import { SparkRenderer, SplatMesh } from "./Spark/spark.module.js";
+import { SparkRenderer, SplatMesh } from "./Spark/dist/spark.module.js";
 THREE.ColorManagement.enabled = false;
 const canvas = document.getElementById("canvas");
 const renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });

@@ -121,6 +121,17 @@ _HELP = {
       georef export-tiles flight --compression none --archive --to plain
       georef export-tiles flight --crs EPSG:2056 --cesium Cesium/
     """,
+    "export-html": """
+    One file that any browser opens from the disk or from a mail, without a server and without a network: the splat,
+    the cameras, control and check points, the measurements saved in `georef view`, accuracy and cautions. A splat
+    too large for --max-megabytes is reduced, and the page says by how much.
+
+    \b
+    Examples:
+      georef export-html flight
+      georef export-html flight --to flight.html --max-megabytes 10
+      georef export-html flight --crs EPSG:2056 --sh-degree 1
+    """,
     "export-cameras": """
     colmap/ and transforms.json (nerfstudio) are in the frame of splat.ply, as is undistorted/: photographs without
     lens distortion and their COLMAP model, for other trainers. cameras.csv has positions in the CRS of the
@@ -132,6 +143,17 @@ _HELP = {
       georef export-cameras flight
       georef export-cameras flight --crs EPSG:32632 --to handover/cameras
       georef export-cameras flight --undistorted --to trainer
+    """,
+    "export-opf": """
+    Open Photogrammetry Format 1.0: adjusted cameras and lenses, tie points, measured positions, control and check
+    points with their marks. Put it beside the photographs, whose names it lists. Without --crs, its map is a
+    projection around the scene that is true to scale there.
+
+    \b
+    Examples:
+      georef export-opf flight
+      georef export-opf flight --to handover/opf
+      georef export-opf flight --crs EPSG:32632+3855
     """,
     "report": """
     A cover with names, logo, pictures and the facts of the survey; verdicts with their rules; accuracy, control and
@@ -170,7 +192,9 @@ _DELIVERS: dict[str, Literal["file", "folder"]] = {
     "export-mesh": "file",
     "export-spz": "file",
     "export-tiles": "folder",
+    "export-html": "file",
     "export-cameras": "folder",
+    "export-opf": "folder",
     "report": "file",
     "change": "folder",
 }

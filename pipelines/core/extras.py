@@ -13,12 +13,24 @@ from urllib.request import url2pathname
 from pipelines.core.errors import BackendUnavailableError
 
 Extra = Literal[
-    "bags", "cluster", "heif", "learned", "mesh", "reference", "scans", "simulator", "terrain", "vectors", "viewer"
+    "bags",
+    "cluster",
+    "copc",
+    "heif",
+    "learned",
+    "mesh",
+    "reference",
+    "scans",
+    "simulator",
+    "terrain",
+    "vectors",
+    "viewer",
 ]
 # What needs each extra, and the libraries that it installs, by the names of their packages.
 EXTRAS: dict[Extra, tuple[str, tuple[str, ...]]] = {
     "bags": ("a ROS bag (--bag, georef inspect)", ("rosbags",)),
     "cluster": ("a cluster (--cluster, georef cluster)", ("distributed", "cryptography")),
+    "copc": ("a cloud for the web (georef export-cloud --copc)", ("copclib",)),
     "heif": ("HEIC photographs", ("pillow-heif",)),
     "learned": ("learned features (--features learned)", ("kornia",)),
     "mesh": ("georef export-mesh", ("trimesh",)),
@@ -35,6 +47,7 @@ CORE_MB = 1900
 SIZES_MB: dict[Extra | Literal["cuda"], int] = {
     "bags": 22,
     "cluster": 52,
+    "copc": 2,
     "heif": 27,
     "learned": 29,
     "mesh": 4,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines import __version__
-from pipelines.core.errors import InputError, MissingProductError
+from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.manifest import FileRecord, Memo, hash_file
 from pipelines.core.options import InputMarker, StageOptions, flag_name, input_markers, input_paths
@@ -88,12 +88,9 @@ def fingerprints(
 
 def hashes_of(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str, str]:
     """Return the hash of a part and of the products read with it; none for a missing or empty optional part."""
-    try:
-        path = workspace.path(part.product)
-    except MissingProductError:
-        if part.optional:
-            return {}
-        raise
+    if part.optional and not workspace.has(part.product):
+        return {}
+    path = workspace.path(part.product)
     try:
         values = _values(path, part)
     except ValueError:  # not JSON: the stage that reads the product raises the error

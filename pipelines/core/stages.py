@@ -44,6 +44,8 @@ MEASURABLE_SPLAT = "measurable/splat.measurable.ply"
 SPZ = "spz/splat.spz"
 TILES = "tiles/tileset.json"
 TILES_GLB = "tiles/splat.glb"
+HTML = "html/splat.html"
+OPF = "opf/project.opf"
 REPORT_PAGE = "report/report.html"
 CHANGE_FIGURES, CHANGE_PAGE = "change/change.json", "change/change.html"
 LIDAR, LIDAR_MAP = "train/lidar.json", "train/lidar.png"  # only of a training with LiDAR
@@ -54,6 +56,8 @@ SCAFFOLD = "scaffold/gaussians.ply"
 BLOCK_GAUSSIANS = "block/gaussians.ply"
 BLOCK_TRAINING = "block/record.json"
 FIRST_CELL = "seams/0.ply"
+SAVED_MEASUREMENTS = "view/measurements.geojson"
+OF_NO_STAGE = frozenset({SAVED_MEASUREMENTS})  # products that the user makes, in the viewer
 
 
 @dataclass(frozen=True)
@@ -270,7 +274,7 @@ CLEAN = StageSpec(
 
 # What a survey hands over besides the PLY: each is made on request, and none is read by another stage.
 # Files that the report lists, with their hashes.
-DELIVERED = (SPLAT, MEASURABLE_SPLAT, "raster/dsm.tif", CLOUD, MESH, SPZ, TILES, "cameras/cameras.csv")
+DELIVERED = (SPLAT, MEASURABLE_SPLAT, "raster/dsm.tif", CLOUD, MESH, SPZ, TILES, HTML, "cameras/cameras.csv", OPF)
 DELIVERABLES: tuple[StageSpec, ...] = (
     StageSpec(
         name="export-measurable",
@@ -330,6 +334,21 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         also=(TILES_GLB,),
     ),
     StageSpec(
+        name="export-html",
+        module="pipelines.deliver.html",
+        options_place="pipelines.deliver.options:ExportHtmlOptions",
+        reads=(
+            MEASURED,
+            *whole_products(SPARSE, MODEL, GAUSSIANS),
+            *TAKEN,
+            *whole_products(SIM3, SAVED_MEASUREMENTS, optional=True),
+            APPLIED_RIG,
+            HEADLINE,
+        ),
+        product=HTML,
+        title="Write the splat with its viewer as one HTML file.",
+    ),
+    StageSpec(
         name="export-cameras",
         module="pipelines.deliver.cameras",
         options_place="pipelines.deliver.options:ExportCamerasOptions",
@@ -344,6 +363,14 @@ DELIVERABLES: tuple[StageSpec, ...] = (
             "cameras/covariances.npz",
             "cameras/camera_covariances.csv",
         ),
+    ),
+    StageSpec(
+        name="export-opf",
+        module="pipelines.deliver.opf",
+        options_place="pipelines.deliver.options:ExportOpfOptions",
+        reads=(MEASURED, *SOLVED, APPLIED_RIG, HEADLINE),
+        product=OPF,
+        title="Write cameras, tie points and marks as an OPF project.",
     ),
     StageSpec(
         name="report",

@@ -24,6 +24,7 @@ from pipelines.core.stages import (
     CHANGE,
     CLEAN,
     DELIVERABLES,
+    OF_NO_STAGE,
     PIPELINE,
     StageSpec,
     producer_of,
@@ -282,7 +283,8 @@ def _interrupted(workspace: Workspace, spec: StageSpec) -> str:
 
 
 def producers(spec: StageSpec) -> list[StageSpec]:
-    return list(dict.fromkeys(producer_of(part.product) for part in spec.reads))
+    products = (part.product for part in spec.reads if part.product not in OF_NO_STAGE)
+    return list(dict.fromkeys(map(producer_of, products)))
 
 
 def cautions_by_stage(workspace: Workspace, before: StageSpec | None = None) -> dict[str, tuple[Remark, ...]]:

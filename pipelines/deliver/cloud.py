@@ -24,6 +24,7 @@ from pipelines.deliver.options import ExportCloudOptions
 from pipelines.deliver.placement import median_values
 from pipelines.deliver.surface import ground_below, predicted_sigma, surface_views, without_sigma
 from pipelines.formats.cloud_ply import CloudPlyWriter, CloudPoints
+from pipelines.formats.copc import write_copc
 from pipelines.formats.georef_sidecar import SceneSigma, median_sigma, write_sidecar
 from pipelines.formats.las import LazWriter
 from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_settings
@@ -68,6 +69,10 @@ def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     empty = "The cloud states no σ, and its dimensions sigma_h, sigma_v and cov_ee to cov_uu are empty"
     cautions = union(trained.model.cautions, without_sigma(empty, no_sigma))
     sidecar = target.sidecar(tally.bounds, headline_of(stage.workspace), tally.sigma(), cautions)
+    if options.copc:
+        copc = laz.with_suffix(".copc.laz")
+        write_copc(laz, copc)
+        paths = (*paths, copc)
     for path in paths:
         write_sidecar(sidecar, path)
     views.close()

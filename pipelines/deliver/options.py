@@ -5,7 +5,8 @@ from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field
 
-from pipelines.core.options import ExtraMarker
+from pipelines.core.extras import require
+from pipelines.core.options import ExtraMarker, NeedMarker
 from pipelines.survey.options import CropOptions, CrsOptions, FilledAreaOptions
 
 # The page was tried with this version: the extensions of splats in glTF are younger than those of meshes.
@@ -75,6 +76,16 @@ class ExportSpzOptions(WebSplatOptions):
     spz_version: Literal["3", "4"] = Field(
         "3", description="Version of the format: CesiumJS and Spark read 3, PlayCanvas reads 4 only."
     )
+    embed_georeference: bool = Field(
+        False,
+        description="With --spz-version 4, experimental: write the place on Earth into the file itself too, in the "
+        "form that the authors of SPZ propose. It may change until they have decided.",
+    )
+
+
+def _require_copc(copc: bool) -> None:
+    if copc:
+        require("copc")
 
 
 class TerrainOptions(FilledAreaOptions):
@@ -124,6 +135,11 @@ class ExportCloudOptions(CrsOptions, TerrainOptions):
     )
     min_views: int = Field(3, ge=2, description="Number of training views that must agree on a point.")
     ply: bool = Field(False, description="Write the same points as cloud.ply too.")
+    copc: Annotated[bool, NeedMarker(_require_copc)] = Field(
+        False,
+        description="Write the same points as cloud.copc.laz too: a Cloud Optimized Point Cloud, of which viewers "
+        "on the web load what they show. Its making holds all points in memory.",
+    )
 
 
 class ExportMeshOptions(CrsOptions, FilledAreaOptions):
@@ -167,6 +183,16 @@ class ExportCamerasOptions(CrsOptions):
     )
 
 
+class ExportOpfOptions(CrsOptions):
+    """Options of the export as an OPF project."""
+
+    crs: str | None = Field(
+        None,
+        description="CRS of the project, that of a map: EPSG:32632, EPSG:32632+3855, a PROJ string or WKT. Without "
+        "it: a transverse Mercator projection around the scene, with heights above the ellipsoid.",
+    )
+
+
 def _cesium_folder(text: str) -> str:
     address = urlsplit(text)
     if not text.strip() or any(char.isspace() or not char.isprintable() for char in text):
@@ -178,14 +204,31 @@ def _cesium_folder(text: str) -> str:
     return text if text.endswith("/") else text + "/"
 
 
-class PageOptions(CrsOptions):
-    """Options of the page that shows tiles in a browser."""
+class ShownCrsOptions(CrsOptions):
+    """Options of the coordinates that a page shows."""
 
     crs: str | None = Field(
         None,
         description="CRS in which the page shows coordinates: EPSG:32632, EPSG:32632+3855, a PROJ string or WKT. "
         "Without it: the UTM zone of the scene.",
     )
+
+
+class ExportHtmlOptions(WebSplatOptions, ShownCrsOptions):
+    """Options of the page in one file."""
+
+    max_megabytes: float = Field(
+        20.0,
+        ge=4,
+        le=1000,
+        description="Largest size of the page in MB, as mail takes it. A larger splat loses degrees of its "
+        "harmonics, then Gaussians; the page and the command say what, and how many dB it costs.",
+    )
+
+
+class PageOptions(ShownCrsOptions):
+    """Options of the page that shows tiles in a browser."""
+
     cesium: Annotated[str, AfterValidator(_cesium_folder)] = Field(
         CESIUM,
         description="Address of the folder that holds Cesium.js: https://…, or a path relative to the page, such "

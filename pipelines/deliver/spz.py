@@ -15,8 +15,9 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportSpzOptions
 from pipelines.deliver.placement import ENU_FROM_Y_UP
 from pipelines.deliver.splat import codec_arrays, load_splat, splat_values
-from pipelines.formats.georef_sidecar import write_sidecar
+from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
 from pipelines.formats.spz import SpzVersion, write_spz
+from pipelines.formats.spz_extensions import SpzGeoreference
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import transformed
 
@@ -27,15 +28,34 @@ def run(stage: StageRun, options: ExportSpzOptions) -> Summary:
     upright = transformed(splat.gaussians, Similarity(1.0, ENU_FROM_Y_UP.T))
     path = stage.out / Path(SPZ).name
     version: SpzVersion = 3 if options.spz_version == "3" else 4
+    sidecar = splat.placement.sidecar(ENU_FROM_Y_UP)
+    embedded = _georeference(sidecar, version) if options.embed_georeference else None
     try:
-        write_spz(path, codec_arrays(upright, options.sh_degree), version, mip_filter=splat.mip_filter)
+        arrays = codec_arrays(upright, options.sh_degree)
+        write_spz(path, arrays, version, embedded, mip_filter=splat.mip_filter)
     except InputError as error:
         message = f"{error}. `georef export-tiles` writes scenes of any size."
         raise InputError("spz-range", message) from error
-    write_sidecar(splat.placement.sidecar(ENU_FROM_Y_UP), path)
+    write_sidecar(sidecar, path)
     size = path.stat().st_size
     return Summary(
         f"{len(splat.gaussians)} Gaussians, {size / 2**20:.1f} MiB",
-        {**splat_values(splat), "spz_version": version, "bytes": size},
+        {
+            **splat_values(splat),
+            "spz_version": version,
+            "georeference_embedded": embedded is not None,
+            "bytes": size,
+        },
         cautions=splat.placement.cautions,
     )
+
+
+def _georeference(sidecar: GeorefSidecar, version: SpzVersion) -> SpzGeoreference:
+    """Return the sidecar's place for the file itself; an InputError: the version or the frame has none."""
+    if version != 4:
+        message = "Only version 4 of SPZ holds a georeference. Add --spz-version 4."
+        raise InputError("spz-version", message, field="--embed-georeference")
+    if sidecar.crs_id is None:
+        message = "The survey has a local metric frame: there is no place on Earth to embed."
+        raise InputError("not-on-earth", message, field="--embed-georeference")
+    return SpzGeoreference(sidecar.crs_id, sidecar.origin, sidecar.rotation, sidecar.scale, sidecar.epoch)

@@ -32,7 +32,7 @@ from pipelines.deliver.tiles_page import TILESET, ScenePage, scene_page, write_s
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
 from pipelines.formats.gltf import SPLATS, SPZ_IN_GLTF, decode_plain_glb, encode_glb, encode_plain_glb, spz_in_glb
 from pipelines.formats.splat_ply import SplatArrays
-from pipelines.formats.spz import FRACTIONAL_BITS, decode_spz, encode_spz
+from pipelines.formats.spz import decode_spz, encode_wide_spz
 from pipelines.formats.tiles_archive import write_tiles_archive
 from pipelines.splat.level_of_detail import DetailTile, Tiler, best_cut, build_tiles, scene_box, within_budget
 from pipelines.splat.sh import coefficient_count
@@ -41,7 +41,6 @@ from pipelines.survey.target_crs import target_crs, without_grid
 
 log = logging.getLogger(__name__)
 
-_REACH_M = 2.0 ** (23 - FRACTIONAL_BITS)  # largest coordinate that SPZ's 24 bits hold at their finest step
 # Bytes of a Gaussian in SPZ before its compression, or in plain arrays: without harmonics, and of each of these.
 _BYTES: dict[Compression, tuple[int, int]] = {"spz": (17, 3), "none": (48, 12)}
 _COPIES, _ARCHIVED_COPIES = 3, 2  # each Gaussian is in a leaf, in splat.glb, and merged in levels
@@ -224,9 +223,6 @@ def write_glb(
 ) -> None:
     """Write N ≥ 1 Gaussians of an East-North-Up frame as a glb, with `extras` as its `asset.extras`.
 
-    In SPZ, a scene that reaches further than ±2048 m gets coarser steps of position: 0.24 mm up to ±4096 m, and so
-    on.
-
     Raises:
         InputError: values that are not finite.
         OSError: the file cannot be written.
@@ -235,9 +231,7 @@ def write_glb(
     if compression == "none":
         path.write_bytes(encode_plain_glb(splat, extras))
         return
-    furthest = float(np.abs(splat.means).max())
-    coarser = max(0, math.ceil(math.log2((furthest + 1) / _REACH_M))) if math.isfinite(furthest) else 0
-    spz = encode_spz(splat, 3, FRACTIONAL_BITS - coarser)
+    spz = encode_wide_spz(splat)
     low, high = splat.means.min(axis=0).tolist(), splat.means.max(axis=0).tolist()
     path.write_bytes(encode_glb(spz, len(splat), math.isqrt(splat.sh.shape[1]) - 1, (low, high), extras))
 

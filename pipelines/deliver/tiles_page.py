@@ -147,16 +147,14 @@ def scene_page(
         "check": survey.check_points,
     }
     origin = survey.origin_on_earth
-    distance_m = np.linalg.norm(center_in_file, axis=1)
-    radius = max(float(np.quantile(distance_m, _SHOWN)), _LEAST_RADIUS_M)
-    box = float(np.clip(_CRS_BOX * radius, _LEAST_CRS_BOX_M, _MOST_CRS_BOX_M))
+    radius, box = scene_extent_m(center_in_file)
     return ScenePage(
         title=title,
         tileset=TILESET,
         cesium=cesium,
         origin_lla=vector3(placement.origin_lla),
         radius_m=radius,
-        facts=_facts(placement, target),
+        facts=facts_of(placement, target),
         cautions=tuple(caution.sentence for caution in placement.cautions),
         points=tuple(
             PagePoint(name=point.name, kind=kind, ecef=vector3(ecef_from_enu(point.position_in_geo, origin)))
@@ -167,13 +165,27 @@ def scene_page(
     )
 
 
+def scene_extent_m(center_in_file: Float32Array) -> tuple[float, float]:
+    """Return the radius of a scene for its first view, and half of the side of the box with coordinates in a CRS.
+
+    Args:
+        center_in_file: (N, 3) centres of its Gaussians, metres from the middle of the scene.
+    """
+    distance_m = np.linalg.norm(center_in_file, axis=1)
+    radius_m = max(float(np.quantile(distance_m, _SHOWN)), _LEAST_RADIUS_M)
+    return radius_m, float(np.clip(_CRS_BOX * radius_m, _LEAST_CRS_BOX_M, _MOST_CRS_BOX_M))
+
+
 def write_scene_page(page: ScenePage, folder: Path) -> None:
     """Write the page into a folder, whole or not at all; an OSError: it cannot be written."""
     program = resources.files(__package__).joinpath("templates", "tiles.html").read_text(encoding="utf-8")
     program = program.replace(_POLICY, html.escape(_policy(program, page.cesium)), 1)
-    # No name in the JSON can break out of an HTML script element: `<` only occurs escaped.
-    scene = re.sub("[<>&\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", page.model_dump_json())
-    replace_text(folder / PAGE, program.replace(_PLACEHOLDER, scene, 1))
+    replace_text(folder / PAGE, program.replace(_PLACEHOLDER, script_json(page), 1))
+
+
+def script_json(page: Product) -> str:
+    """Return the content of a page as JSON for a script element, which no name can end: it has no `<`."""
+    return re.sub("[<>&\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", page.model_dump_json())
 
 
 def _policy(program: str, cesium: str) -> str:
@@ -201,7 +213,8 @@ def _policy(program: str, cesium: str) -> str:
     )
 
 
-def _facts(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
+def facts_of(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
+    """Return what the reader of a page must know of its coordinates: CRS, heights, accuracy, assumptions."""
     accuracy = placement.accuracy
     facts = (
         ("CRS", target.crs.name),

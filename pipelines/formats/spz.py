@@ -18,6 +18,7 @@ Readers of SPZ take its axes for right, up, back (x right, y up, z towards the v
 | harmonics of degree 2 and 3 | 1/8 | −1 … 1 |
 """
 
+import math
 import struct
 import zlib
 from collections.abc import Iterator
@@ -32,6 +33,13 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import replacing
 from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.formats.splat_ply import SplatArrays
+from pipelines.formats.spz_extensions import (
+    MOST_BYTES,
+    SpzGeoreference,
+    encode_georeference,
+    georeference_in,
+    require_known_axes,
+)
 
 SpzVersion = Literal[3, 4]
 
@@ -59,6 +67,7 @@ class _Layout:
     count: int
     degree: int
     fractional_bits: int
+    has_extensions: bool = False
 
     @property
     def higher(self) -> int:
@@ -76,9 +85,16 @@ class _Layout:
         return self.count * sum(self.widths)
 
 
-def write_spz(path: Path, splat: SplatArrays, version: SpzVersion = 3, *, mip_filter: bool = False) -> None:
-    """Write Gaussians; the file appears whole or not at all; raises as `encode_spz`."""
-    data = encode_spz(splat, version, mip_filter=mip_filter)
+def write_spz(
+    path: Path,
+    splat: SplatArrays,
+    version: SpzVersion = 3,
+    georeference: SpzGeoreference | None = None,
+    *,
+    mip_filter: bool = False,
+) -> None:
+    """Write Gaussians; the file appears whole or not at all; arguments and errors as of `encode_spz`."""
+    data = encode_spz(splat, version, georeference=georeference, mip_filter=mip_filter)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as draft:
         draft.write_bytes(data)
@@ -89,17 +105,22 @@ def encode_spz(
     version: SpzVersion = 3,
     fractional_bits: int = FRACTIONAL_BITS,
     *,
+    georeference: SpzGeoreference | None = None,
     mip_filter: bool = False,
 ) -> bytes:
     """Return the bytes of an SPZ file, whose Gaussians need the mip filter or not.
+
+    Version 4 can hold a georeference (`spz_extensions`), which is not part of the format yet.
 
     Opacities, colours, scales and harmonics beyond the format's range are clamped to it. Positions have steps of
     2^−bits m and lie within ±2^(23 − bits) m.
 
     Raises:
         InputError: values that are not finite, a rotation of length zero, or positions out of range.
-        ValueError: shapes do not agree, or no Gaussians.
+        ValueError: shapes do not agree, no Gaussians, or a georeference in version 3.
     """
+    if georeference is not None and version != 4:
+        raise ValueError("only version 4 holds a georeference")
     count, coefficients = len(splat.means), splat.sh.shape[1]
     if coefficients not in (1, 4, 9, 16) or splat.sh.shape != (count, coefficients, 3):
         raise ValueError(f"expected spherical harmonics (N, 1 | 4 | 9 | 16, 3), got {splat.sh.shape}")
@@ -117,23 +138,49 @@ def encode_spz(
     import zstandard
 
     packed = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(section.data) for section in sections]
+    extensions = b"" if georeference is None else encode_georeference(georeference)
+    if extensions:
+        flags |= _HAS_EXTENSIONS
     head = _HEADER.pack(_MAGIC, 4, layout.count, degree, fractional_bits, flags, len(packed))
-    head += struct.pack("<I12x", _HEADER4_BYTES)
+    head += struct.pack("<I12x", _HEADER4_BYTES + len(extensions)) + extensions
     table = [_TABLE_ROW.pack(len(part), section.size) for part, section in zip(packed, sections, strict=True)]
     return b"".join((head, *table, *packed))
+
+
+def encode_wide_spz(splat: SplatArrays, *, mip_filter: bool = False) -> bytes:
+    """Return an SPZ file of version 3 of a scene of any extent; errors else as of `encode_spz`.
+
+    A scene that reaches further than ±2048 m gets coarser steps of position: 0.49 mm up to ±4096 m, and so on.
+    """
+    furthest, reach = float(np.abs(splat.means).max()), _POSITION_LIMIT / 2.0**FRACTIONAL_BITS
+    coarser = max(0, math.ceil(math.log2((furthest + 1) / reach))) if math.isfinite(furthest) else 0
+    return encode_spz(splat, 3, FRACTIONAL_BITS - coarser, mip_filter=mip_filter)
 
 
 def decode_spz(data: bytes, path: Path | None = None) -> SplatArrays:
     """Return the Gaussians in the bytes of an SPZ file of version 2, 3 or 4.
 
     Raises:
-        InputError: not an SPZ file of that form, cut off, with extensions, or one that would unpack to more than
-            sixteen times its size (and 16 MiB); names the path.
+        InputError: not an SPZ file of that form, cut off, with other axes than right, up, back, or one that would
+            unpack to more than sixteen times its size (and 16 MiB); names the path.
     """
+    layout, body, _ = _unpacked(data, path)
+    return _dequantised(layout, body)
+
+
+def spz_georeference(data: bytes, path: Path | None = None) -> SpzGeoreference | None:
+    """Return the georeference that an SPZ file holds; None: none. Errors as of `decode_spz`, or it is damaged."""
+    return georeference_in(_unpacked(data, path)[2], path)
+
+
+def _unpacked(data: bytes, path: Path | None) -> tuple[_Layout, ByteArray, bytes]:
+    """Return what the header states, the sections one after the other, and the extensions."""
     limit_bytes = max(_SMALL_BYTES, _MOST_UNPACKED * len(data))
     unpacked = _unpacked_gzip if data[:2] == b"\x1f\x8b" else _unpacked_zstd
-    layout, body = unpacked(data, limit_bytes, path)
-    return _dequantised(layout, body)
+    layout, body, extensions = unpacked(data, limit_bytes, path)
+    if layout.has_extensions:
+        require_known_axes(extensions, path)
+    return layout, body, extensions
 
 
 def _check_values(splat: SplatArrays, fractional_bits: int) -> None:
@@ -156,25 +203,27 @@ def _check_values(splat: SplatArrays, fractional_bits: int) -> None:
         raise InputError("spz-range", message, field="means")
 
 
-def _unpacked_gzip(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_Layout, ByteArray]:
+def _unpacked_gzip(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_Layout, ByteArray, bytes]:
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         head = stream.decompress(data, _HEADER.size)
         layout = _stated_layout(head, (2, 3), limit_bytes, path)
         # One byte more than promised tells a longer stream from a whole one.
-        body = stream.decompress(stream.unconsumed_tail, layout.body_bytes + 1)
+        behind = MOST_BYTES if layout.has_extensions else 0
+        body = stream.decompress(stream.unconsumed_tail, layout.body_bytes + behind + 1)
     except zlib.error as error:
         raise _damage(f"{error}", path) from error
-    if len(body) != layout.body_bytes or not stream.eof:
+    if not layout.body_bytes <= len(body) <= layout.body_bytes + behind or not stream.eof:
         held = "more" if len(body) > layout.body_bytes else "fewer"
         message = (
             f"The header promises {layout.count} Gaussians in {layout.body_bytes} bytes, the file holds {held}."
         )
         raise InputError("size-differs", f"{message} It is cut off or damaged.", path=path)
-    return layout, np.frombuffer(body, np.uint8)
+    extensions = body[layout.body_bytes :]
+    return layout, np.frombuffer(body, np.uint8, layout.body_bytes), extensions
 
 
-def _unpacked_zstd(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_Layout, ByteArray]:
+def _unpacked_zstd(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_Layout, ByteArray, bytes]:
     import zstandard
 
     layout = _stated_layout(data[: _HEADER.size], (4,), limit_bytes, path)
@@ -201,7 +250,8 @@ def _unpacked_zstd(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_L
             raise InputError("unpacked-size-differs", message, path=path)
         parts.append(part)
         place += packed
-    return layout, np.frombuffer(b"".join(parts), np.uint8)
+    extensions = data[_HEADER4_BYTES:table] if layout.has_extensions else b""
+    return layout, np.frombuffer(b"".join(parts), np.uint8), extensions
 
 
 def _damage(reason: str, path: Path | None) -> InputError:
@@ -221,9 +271,7 @@ def _stated_layout(head: bytes, versions: tuple[int, ...], limit_bytes: int, pat
             "expected at least one Gaussian, degree 0 to 3 and 1 to 23 bits."
         )
         raise InputError("spz-header", message, path=path)
-    if flags & _HAS_EXTENSIONS:
-        raise InputError("spz-extensions", "SPZ files with extensions are not supported.", path=path)
-    layout = _Layout(version, count, degree, fractional_bits)
+    layout = _Layout(version, count, degree, fractional_bits, bool(flags & _HAS_EXTENSIONS))
     if layout.body_bytes > limit_bytes:
         size, limit = layout.body_bytes / 2**20, limit_bytes / 2**20
         message = f"The header promises {size:.0f} MiB; the limit for a file of this size is {limit:.0f} MiB."

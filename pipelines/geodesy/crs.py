@@ -129,6 +129,16 @@ class PointCrs:
         """As WKT2:2019."""
         return str(self._crs.to_wkt("WKT2_2019"))
 
+    def with_heights(self) -> tuple[str, float]:
+        """Return WKT2:2019 with three axes, and the metres in a unit of its heights.
+
+        The CRS of a map alone gets heights above its ellipsoid, whose unit may be another than `height_unit_m`.
+        """
+        crs = self._crs if self._crs.is_compound or self._crs.is_bound else self._crs.to_3d()
+        axes = crs.axis_info
+        unit_m = float(axes[2].unit_conversion_factor) if len(axes) == 3 else self.height_unit_m
+        return str(crs.to_wkt("WKT2_2019")), unit_m
+
     @property
     def wkt1(self) -> str:
         """As WKT1 in GDAL's dialect, for formats older than WKT2, such as LAS.
@@ -248,6 +258,9 @@ class _LocalFrame(PointCrs):
     @property
     def wkt(self) -> str:
         return ""
+
+    def with_heights(self) -> tuple[str, float]:
+        return str(self._crs.to_wkt("WKT2_2019")), 1.0
 
     @property
     def wkt1(self) -> str:
@@ -415,11 +428,7 @@ def grid_from_enu(crs: PointCrs, lla: ArrayLike) -> FloatArray:
     rotations = np.tile(np.eye(3), (len(places), 1, 1))
     if crs.is_geographic or crs.is_geocentric or not len(places):
         return rotations
-    axes = ecef_from_enu_rotation(places)
-    steps = _STEP_M * np.stack([axes[..., 0], -axes[..., 0], axes[..., 1], -axes[..., 1]])
-    moved = crs.xyz_from_lla(lla_from_ecef(ecef_from_lla(places) + steps).reshape(-1, 3)).reshape(4, -1, 3)
-    by_enu = np.stack([moved[0] - moved[1], moved[2] - moved[3]], axis=-1)[:, :2]  # (n, xy, east and north)
-    left, _, right = np.linalg.svd(by_enu)
+    left, _, right = np.linalg.svd(_grid_by_enu(crs, places))
     rotations[:, :2, :2] = left @ right
     if (np.linalg.det(rotations) < 0).any():
         raise InputError(
@@ -428,6 +437,23 @@ def grid_from_enu(crs: PointCrs, lla: ArrayLike) -> FloatArray:
             "with easting and northing.",
         )
     return rotations
+
+
+def grid_scale(crs: PointCrs, lla: ArrayLike) -> FloatArray:
+    """Return the lengths (n,) in metres on a map of a metre on the ground, at places `lla` (n, 3).
+
+    It is the mean of both directions, and counts the height above the ellipsoid.
+    """
+    singular = np.linalg.svd(_grid_by_enu(crs, np.asarray(lla, dtype=np.float64)), compute_uv=False)
+    return np.asarray(singular.mean(axis=1) * crs.horizontal_unit)
+
+
+def _grid_by_enu(crs: PointCrs, places: FloatArray) -> FloatArray:
+    """Return the change (n, 2, 2) of easting and northing by a metre to the true east and north of places."""
+    axes = ecef_from_enu_rotation(places)
+    steps = _STEP_M * np.stack([axes[..., 0], -axes[..., 0], axes[..., 1], -axes[..., 1]])
+    moved = crs.xyz_from_lla(lla_from_ecef(ecef_from_lla(places) + steps).reshape(-1, 3)).reshape(4, -1, 3)
+    return np.stack([moved[0] - moved[1], moved[2] - moved[3]], axis=-1)[:, :2] / (2 * _STEP_M)
 
 
 def file_in(text: str) -> str | None:

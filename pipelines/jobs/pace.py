@@ -34,7 +34,9 @@ _MODELS: dict[str, tuple[float, float, float]] = {
     "export-mesh": (4.0, 0.2, 5.0),
     "export-spz": (0.5, 0.0, 0.05),
     "export-tiles": (1.0, 0.0, 0.2),
+    "export-html": (1.0, 0.0, 0.1),
     "export-cameras": (1.0, 0.02, 0.0),
+    "export-opf": (1.0, 0.02, 0.0),
     "report": (5.0, 0.1, 0.0),
 }
 _KEPT = 5  # runs of a stage

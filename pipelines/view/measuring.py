@@ -20,6 +20,7 @@ from pipelines.surface.plan_heights import cameras_of, heights_in_plan
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import MarkRays
 from pipelines.survey.options import CrsOptions
+from pipelines.survey.saved_measurements import Quantity
 from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.survey.trained_survey import triangulated_points
 from pipelines.view import quantities
@@ -104,7 +105,7 @@ class MeasuringModel:
         height_m = np.asarray(self.target.xyz_from_geo(position)[:, 2] * self.target.crs.height_unit_m)
         return quantities.MeasuredPoints(position, cov, height_m)
 
-    def area(self, corners: Sequence[SurfacePoint], fineness: Fineness) -> tuple[quantities.Quantity, ...]:
+    def area(self, corners: Sequence[SurfacePoint], fineness: Fineness) -> tuple[Quantity, ...]:
         """Return the area of a polygon, in plan and on the surface."""
         sampled = self._sampled(corners, fineness)
         if sampled is None:
@@ -112,9 +113,7 @@ class MeasuringModel:
         surface, coverage = sampled
         return quantities.plan_area(surface.corners), quantities.surface_area(surface), coverage
 
-    def volume(
-        self, corners: Sequence[SurfacePoint], base: WantedBase, fineness: Fineness
-    ) -> tuple[quantities.Quantity, ...]:
+    def volume(self, corners: Sequence[SurfacePoint], base: WantedBase, fineness: Fineness) -> tuple[Quantity, ...]:
         """Return the volume between the surface within a polygon and a base; nothing where there is no surface.
 
         Raises:
@@ -195,7 +194,7 @@ class MeasuringModel:
 
     def _sampled(
         self, corners: Sequence[SurfacePoint], fineness: Fineness
-    ) -> tuple[quantities.SampledSurface, quantities.Quantity] | None:
+    ) -> tuple[quantities.SampledSurface, Quantity] | None:
         """Return the surface in a polygon, and how densely it was read; None: there is none."""
         joint = self.jointly(corners)
         area, pixel_m = quantities.plan_area(joint).value, self._pixel_m(corners)
@@ -224,7 +223,7 @@ class MeasuringModel:
             pixel_m=pixel_m,
         )  # fmt: skip
         share = 100 * (len(rows) / len(grid))
-        return surface, quantities.Quantity(f"measured every {spacing:.2f} m, on", share, None, "% of the area")
+        return surface, Quantity(f"measured every {spacing:.2f} m, on", share, None, "% of the area")
 
     def _pixel_m(self, points: Sequence[SurfacePoint]) -> float:
         """Return the mean width of a training pixel at points."""

@@ -9,24 +9,12 @@ from typing import Literal
 
 import numpy as np
 import shapely
-from pydantic import ConfigDict
 from scipy.spatial import Delaunay
 
 from pipelines.core.types import FloatArray, IntArray
+from pipelines.survey.saved_measurements import Quantity
 
 RimBase = Literal["plane", "mean", "lowest"]
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """Measured quantity with its standard deviation in the same unit; None: not known. Saved with measurements."""
-
-    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-    name: str
-    value: float
-    sigma: float | None
-    unit: str
 
 
 @dataclass(frozen=True)

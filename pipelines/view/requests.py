@@ -9,9 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pipelines.core.products import ImageName
 from pipelines.core.types import FloatArray
 from pipelines.surface.picking import SurfacePoint
+from pipelines.survey.saved_measurements import Kind
 from pipelines.view.measuring import WantedBase
 from pipelines.view.pictures import Box, Colouring, ViewerCamera, Wanted
-from pipelines.view.saved import Kind
 
 _MOST_PX = 4096
 Number = Annotated[float, Field(ge=-1e9, le=1e9)]

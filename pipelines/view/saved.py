@@ -8,31 +8,23 @@ them, so that σ of what is made of several measurements is again the joint one.
 in the tables.
 """
 
-import json
-import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
 
 import shapely
-from pydantic import Field, ValidationError
 
-from pipelines.core.errors import InputError, storage_failures
+from pipelines.core.errors import storage_failures
 from pipelines.core.extras import extra_part
 from pipelines.core.files import replace_texts
 from pipelines.core.lock import WriteLock
-from pipelines.core.products import ImageName, Product
-from pipelines.core.types import Matrix3, Vector3
+from pipelines.core.stages import SAVED_MEASUREMENTS
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import Json, feature, features_text, replacing_features_gpkg
-from pipelines.view.quantities import Quantity
+from pipelines.survey.saved_measurements import CLOSED, MEASUREMENTS, Kind, NamedMeasurement, read_measurements
 
-FOLDER = "view"  # of the workspace: what the user saves in the viewer
+FOLDER = Path(SAVED_MEASUREMENTS).parent.name  # of the workspace: what the user saves in the viewer
 _PATIENCE_S = 5.0  # for another viewer, which holds the folder for the time of one write
-MEASUREMENTS = "measurements.geojson"
-Kind = Literal["point", "distance", "polyline", "area", "volume", "profile"]
-CLOSED: tuple[Kind, ...] = ("area", "volume")
 TABLES: dict[Kind, str] = {
     "point": "points.csv",
     "distance": "distances.csv",
@@ -43,7 +35,6 @@ TABLES: dict[Kind, str] = {
 }
 PACKAGE = "measurements.gpkg"  # where the extra `vectors` is installed
 FILES = (MEASUREMENTS, PACKAGE, *TABLES.values())
-_MOST_BYTES = 64 << 20
 _PLACE = ("x", "y", "z", "sigma_e_m", "sigma_n_m", "sigma_u_m")
 
 
@@ -63,49 +54,6 @@ def changing(folder: Path) -> Iterator[None]:
         except OSError as error:
             error.filename = error.filename or str(folder)
             raise
-
-
-def new_id() -> str:
-    return uuid.uuid4().hex
-
-
-class SavedPoint(Product):
-    """Point of a measurement.
-
-    Attributes:
-        position_in_geo: metres.
-        cov_of_surface: 3×3, m², of the surface alone; of rank one under a line of sight.
-        images: names of the photographs that show it.
-        xyz: in the CRS.
-        sigma_m: east, north, up; None: not known.
-        lla: latitude and longitude in degrees, ellipsoidal height in metres; None: in a local frame.
-    """
-
-    position_in_geo: Vector3
-    cov_of_surface: Matrix3
-    images: tuple[ImageName, ...]
-    xyz: Vector3
-    sigma_m: Vector3 | None
-    lla: Vector3 | None
-
-
-class NamedMeasurement(Product):
-    """Saved measurement.
-
-    Attributes:
-        id: by which viewers know it, whatever its name.
-        crs: name of the CRS of `xyz`.
-        model: hash of the trained model in which it was measured.
-    """
-
-    format_version: Literal[1] = 1
-    id: str = Field(default_factory=new_id, pattern="^[0-9a-f]{32}$")
-    name: str = Field(min_length=1, max_length=200)
-    kind: Kind
-    crs: str
-    model: str
-    points: tuple[SavedPoint, ...] = Field(min_length=1, max_length=10_000)
-    quantities: tuple[Quantity, ...] = ()
 
 
 class SavedMeasurements:
@@ -207,33 +155,6 @@ def _wkt(measurement: NamedMeasurement) -> str:
     if measurement.kind in CLOSED and len(places) > 2:
         return f"POLYGON Z (({', '.join([*places, places[0]])}))"
     return f"LINESTRING Z ({', '.join(places)})"
-
-
-def read_measurements(folder: Path) -> list[NamedMeasurement]:
-    """Return the saved measurements of a folder; none without a file. An InputError names a bad file or feature."""
-    path = folder / MEASUREMENTS
-    if not path.exists():
-        return []
-    if path.stat().st_size > _MOST_BYTES:
-        message = f"is larger than {_MOST_BYTES >> 20} MiB; move the file away."
-        raise InputError("measurements-too-large", message, path=path)
-    try:
-        document = json.loads(path.read_text("utf-8"))
-        features = document["features"]
-        measurements = [each["properties"]["georef"] for each in features]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        message = "is no file of saved measurements; move the file away."
-        raise InputError("not-measurements", message, path=path) from error
-    read = []
-    for number, each in enumerate(measurements):
-        try:
-            read.append(NamedMeasurement.model_validate(each))
-        except ValidationError as error:
-            first = error.errors()[0]
-            field = f"features[{number}].properties.georef." + ".".join(map(str, first["loc"]))
-            message = f"{first['msg']}; move the file away."
-            raise InputError("measurement-invalid", message, path=path, field=field) from error
-    return read
 
 
 def _feature(measurement: NamedMeasurement) -> Json:

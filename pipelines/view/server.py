@@ -28,10 +28,11 @@ from tornado.web import Application, HTTPError, RequestHandler
 from pipelines.core.errors import GeorefError, StorageError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.workspace import Workspace
+from pipelines.survey.saved_measurements import NamedMeasurement
 from pipelines.view import requests
 from pipelines.view.exports import profile_file
 from pipelines.view.options import ViewOptions
-from pipelines.view.saved import FILES, NamedMeasurement
+from pipelines.view.saved import FILES
 from pipelines.view.viewer import Viewer, jpeg_of, model_stamp
 from pipelines.view.work import Job
 

@@ -23,6 +23,7 @@ from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.picking import NoSurface, SurfacePoint
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import mark_rays, wrong_marks
+from pipelines.survey.saved_measurements import NamedMeasurement, Quantity, SavedPoint, new_id
 from pipelines.survey.scene import photographs
 from pipelines.survey.survey import SurveyedPoint
 from pipelines.survey.trained_survey import load_trained
@@ -42,8 +43,8 @@ from pipelines.view.options import ViewOptions
 from pipelines.view.page_scene import described_scene
 from pipelines.view.pictures import PageView, Painter, Photographs, frame_of
 from pipelines.view.pointing import pointing_covariance
-from pipelines.view.quantities import Profile, Quantity, distances, length
-from pipelines.view.saved import FOLDER, NamedMeasurement, SavedMeasurements, SavedPoint, new_id
+from pipelines.view.quantities import Profile, distances, length
+from pipelines.view.saved import FOLDER, SavedMeasurements
 from pipelines.view.work import Job, Jobs
 
 Json = dict[str, Any]

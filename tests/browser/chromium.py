@@ -119,6 +119,34 @@ LIBRARIES = {
         "87a6890202db9ff63e0fd24c6c51a427eb5159d6a2469112ac3826eb2c20d1d3",
         ".",
     ),
+    "Three": Library(
+        "three",
+        "0.187.0",
+        "422bbb47e0a687c0acb59b18d6e24e4969d595fa3b66d34b57b985f0996d9372"
+        "c1dc0b43bbd71166572744a90093c638cfa28ac37e73ed8ed4addee3598f1eb4",
+        ".",
+    ),
+    "Spark": Library(
+        "@sparkjsdev/spark",
+        "2.2.0",
+        "c1fe45d980263d79e39b6d3f3205d87abf454135f3d89382a34e47c31164683e"
+        "c6ba4f6b1d53c8c1d27a7ead2817d304d2178cbd88fe4f14ba0d3aee72fcba28",
+        ".",
+    ),
+    "Fflate": Library(
+        "fflate",
+        "0.8.2",
+        "70f254e3b39a02809b834a41bf3b20a533e19a1a88e5e26387f248bbcb4f8f9a"
+        "be4fb88bbd6fc901852a984eca381e11d59c8487305a210a50a5aadd045e73f0",
+        ".",
+    ),
+    "Esbuild": Library(
+        "esbuild-wasm",
+        "0.28.2",
+        "19c715c21bf79a63945501c2426d8ec7fadbcbc9ff12a530bd9c44e8f8df8a4a"
+        "eafe55b0f60f565ffbbd1329169e9a2ddcaa3a8f8dba0e041d79adb158a20040",
+        ".",
+    ),
 }
 
 

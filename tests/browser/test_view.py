@@ -19,10 +19,11 @@ from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.workspace import Workspace
 from pipelines.formats.ground_points import read_ground_points
 from pipelines.survey.report import read_report
+from pipelines.survey.saved_measurements import read_measurements
 from pipelines.view.marking import CHECK
 from pipelines.view.options import ViewOptions
 from pipelines.view.pictures import Wanted
-from pipelines.view.saved import FOLDER, read_measurements
+from pipelines.view.saved import FOLDER
 from pipelines.view.server import ViewerServer, served
 from tests.browser.viewer_page import PATIENCE_MS, Opened, opened, wait
 from tests.faults.injection import filled, mounted

@@ -13,8 +13,10 @@ from pipelines.core.products import load_json
 from pipelines.deliver.options import ExportSpzOptions
 from pipelines.deliver.spz import run
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
+from pipelines.formats.spz import decode_spz, spz_georeference
 from pipelines.geodesy.enu import enu_from_ecef
-from pipelines.geometry.similarity import covariance_at
+from pipelines.geometry.rotations import matrix_from_quat_xyzw
+from pipelines.geometry.similarity import Similarity, covariance_at
 from pipelines.splat.sh import evaluate_sh
 from tests.delivered_scenes import GEO_FROM_MODEL, ORIGIN, covariance, splat_arrays, true_ecef, write_trained
 from tests.oracles import read_spz
@@ -92,3 +94,21 @@ def test_a_scene_that_is_too_large_is_refused(tmp_path: Path) -> None:
         run(stage, ExportSpzOptions())
     assert {2048, 1, 40} <= set(numbers(str(error.value).replace("±", ""))) and "export-tiles" in str(error.value)
     assert not (stage.out / "splat.spz").exists()
+
+
+def test_the_place_on_earth_is_embedded_on_request(tmp_path: Path) -> None:
+    """What the file says of itself is what its sidecar says: a reader of either puts a Gaussian at its place."""
+    splat = splat_arrays()
+    stage = write_trained(tmp_path / "ws", splat, "spz")
+    summary = run(stage, ExportSpzOptions(spz_version="4", embed_georeference=True))
+    data = (stage.out / "splat.spz").read_bytes()
+    place = spz_georeference(data)
+    assert place is not None and place.crs == "EPSG:4978" and summary.values["georeference_embedded"]
+    turned = Similarity(place.scale, matrix_from_quat_xyzw(place.quat_xyzw), np.array(place.origin))
+    # Half a step of 2^-12 m along each axis.
+    atol = np.sqrt(3) * 0.5 / 4096 + 1e-5
+    np.testing.assert_allclose(turned.apply(decode_spz(data).means), true_ecef(splat), rtol=0, atol=atol)
+    run(stage, ExportSpzOptions(spz_version="4"))
+    assert spz_georeference((stage.out / "splat.spz").read_bytes()) is None
+    with refused("spz-version", InputError):
+        run(stage, ExportSpzOptions(embed_georeference=True))

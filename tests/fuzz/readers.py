@@ -45,7 +45,8 @@ from pipelines.formats.image_file import inspect_image, read_bytes
 from pipelines.formats.metashape import read_cameras, read_markers, read_markers_xml
 from pipelines.formats.opf import read_opf_points
 from pipelines.formats.splat_ply import SplatArrays, read_splat_ply, write_splat_ply
-from pipelines.formats.spz import write_spz
+from pipelines.formats.spz import spz_georeference, write_spz
+from pipelines.formats.spz_extensions import SpzGeoreference
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin
@@ -303,12 +304,20 @@ def _depth_maps(folder: Path) -> None:
     cv2.imwrite(str(folder / "c.tif"), values.astype(np.float32))
 
 
+def _read_spz(folder: Path) -> None:
+    for name in ("a.spz", "b.spz", "c.spz"):
+        read_spz(folder / name)
+    spz_georeference((folder / "c.spz").read_bytes())
+
+
 def _spz(folder: Path) -> None:
     _splat(folder)
     splat = read_splat_ply(folder / "a.ply")
     (folder / "a.ply").unlink()
     write_spz(folder / "a.spz", splat, 3)
     write_spz(folder / "b.spz", splat, 4)
+    place = SpzGeoreference("EPSG:4978", (4e6, -1e4, 4.9e6), (0.5, 0.5, 0.5, 0.5))
+    write_spz(folder / "c.spz", splat, 4, place)
 
 
 def _sidecar(folder: Path) -> None:
@@ -483,7 +492,7 @@ READERS: dict[str, Reader] = {
     "bag-db3": Reader(_bag(StoragePlugin.SQLITE3), _read_bag("bag/*.db3"), "bag/*.db3"),
     "bag-db3-zstd": Reader(_bag(StoragePlugin.SQLITE3, CompressionMode.MESSAGE), _read_bag("bag"), "bag/*"),
     "bag-ros1": Reader(_bag1, _read_bag("*.bag")),
-    "spz": Reader(_spz, lambda folder: (read_spz(folder / "a.spz"), read_spz(folder / "b.spz"))),
+    "spz": Reader(_spz, _read_spz),
     "clouds": Reader(_clouds, _read_clouds),
     "e57": Reader(
         _e57, lambda folder: [_attempt(lambda p=p: list(open_e57(p).chunks(9))) for p in folder.iterdir()]

@@ -14,18 +14,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipelines.core.errors import InputError
-from pipelines.view import saved
-from pipelines.view.quantities import Quantity
-from pipelines.view.saved import (
+from pipelines.survey.saved_measurements import (
     MEASUREMENTS,
-    PACKAGE,
-    TABLES,
     Kind,
     NamedMeasurement,
-    SavedMeasurements,
+    Quantity,
     SavedPoint,
     read_measurements,
 )
+from pipelines.view import saved
+from pipelines.view.saved import PACKAGE, TABLES, SavedMeasurements
 from tests.refusals import refused
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), min_size=1, max_size=8)
