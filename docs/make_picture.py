@@ -35,6 +35,7 @@ from pipelines.view.server import served
 
 IMAGES = Path(__file__).parent / "images"
 DRAWING = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", NO_NETWORK)
+_TILES_ROUNDS = 20
 GAP_PX, WIDTH_PX, QUALITY = 12, 1600, 78
 
 
@@ -116,7 +117,7 @@ def parts_of_report(page: Path) -> np.ndarray:
         tab = browser.new_page(viewport={"width": 1120, "height": 1240})
         tab.goto(page.absolute().as_uri())
         shots = [tab.screenshot()]
-        shots += [tab.locator(part).first.screenshot() for part in ("#place figure", "#check-points .points")]
+        shots += [tab.locator(part).first.screenshot() for part in ("#place figure", "#check-points .chips")]
         browser.close()
     summary, plan, chips = (decoded(shot) for shot in shots)
     chips = chips[: summary.shape[0] - plan.shape[0] * chips.shape[1] // plan.shape[1] - GAP_PX]
@@ -145,7 +146,7 @@ def viewer_pages(workspace: Workspace) -> dict[str, np.ndarray]:
         page.goto(f"{server.address}#tab=measure&kind=volume&shown=points,errors,boundary")
         page.wait_for_selector("body[data-ready]", timeout=30_000)
         settled(page)
-        for place in ((317, 458), (538, 432), (590, 510), (356, 536)):
+        for place in ((346, 256), (576, 256), (614, 442), (371, 461)):
             page.mouse.click(*place)
             time.sleep(1.0)
         page.keyboard.press("Enter")
@@ -182,16 +183,20 @@ def tiles_page(folder: Path) -> np.ndarray:
         browser = driver.chromium.launch(executable_path=chromium_path(), args=list(DRAWING))
         page = browser.new_page(viewport={"width": 1280, "height": 720})
         page.goto(f"http://127.0.0.1:{server.server_port}/{folder.name}/")
-        page.evaluate(
-            "async () => { const { tileset } = await georef;"
-            " while (!tileset.tilesLoaded) await new Promise((next) => setTimeout(next, 500)); }"
-        )
-        time.sleep(20.0)  # without a graphics card, splats are sorted and drawn once in seconds
-        picture = decoded(page.screenshot(timeout=120_000))
+        shot = b""
+        for _ in range(_TILES_ROUNDS):  # finer tiles come after coarser ones, and splats are sorted beside
+            page.evaluate(
+                "async () => { const { tileset } = await georef;"
+                " while (!tileset.tilesLoaded) await new Promise((next) => setTimeout(next, 500)); }"
+            )
+            time.sleep(10.0)
+            shot, before = page.screenshot(timeout=120_000), shot
+            if shot == before:  # it stands still
+                break
         browser.close()
     server.shutdown()
     server.server_close()
-    return picture
+    return decoded(shot)
 
 
 def decoded(png: bytes) -> np.ndarray:
