@@ -32,10 +32,10 @@ class CleanOptions(CropOptions):
         description="Largest number of Gaussians: those that show least in training views are merged into their "
         "neighbours. Without it: all stay.",
     )
-    appearance_passes: int = Field(
-        5,
+    refit_passes: int = Field(
+        8,
         ge=0,
         le=1000,
-        description="With --gaussians or --sh-degree: passes over the training views, in which colours and "
-        "opacities of what stays are fitted to the renders of the trained model.",
+        description="With --gaussians or --sh-degree: passes over the training views, in which what stays is "
+        "fitted to the renders of the trained model.",
     )

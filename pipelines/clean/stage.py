@@ -6,7 +6,7 @@
    photographs whose error grows with the opacity.
 3. With --gaussians, those that show least in the training views are merged into their neighbours
    (`splat.consolidation`). With --sh-degree, harmonics are cut off.
-4. After step 3, colours and opacities are fitted to the renders of the trained model. No centre moves.
+4. After step 3, what is left is fitted to the renders of the trained model.
 
 Reads `ingest/survey.json`, the photographs, `sfm/sparse`, `sim3/`, `train/model.json` and `train/gaussians.ply`.
 Writes `clean/gaussians.ply` (frame `model`), which the files of the splat take, `clean/clean.json`,
@@ -33,9 +33,10 @@ from pipelines.core.stages import CLEANED, CLEANING, MODEL, REMOVED
 from pipelines.core.types import BoolArray, ByteArray
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.geometry.cameras import ViewPose, pose_matrix
-from pipelines.splat.appearance import ShownView, refine_appearance, shuffled_passes
+from pipelines.splat.appearance import WITH_SHAPES, ShownView, refine_appearance, shuffled_passes
 from pipelines.splat.consolidation import consolidated, most_shown
 from pipelines.splat.gaussians import Gaussians, write_gaussians
+from pipelines.splat.initialise import scene_extent
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.sh import coefficient_count
@@ -235,7 +236,7 @@ def _smaller(
         return clean
     cut = replace(left, sh=left.sh[:, :count].contiguous())
     views = clean.trained.indices("train")
-    order = shuffled_passes(len(views), options.appearance_passes, np.random.default_rng(0))
+    order = shuffled_passes(len(views), options.refit_passes, np.random.default_rng(0))
 
     def shown(number: int) -> ShownView:
         pose = clean.pose(views[number])
@@ -244,5 +245,10 @@ def _smaller(
 
     model = clean.trained.model
     settings = RasterSettings(min(model.sh_degree, cut.sh_degree), model.background)
-    fitted = refine_appearance(cut, shown, order, backend, settings, progress=progress) if order else cut
+    if not order:
+        return _showing(clean, cut, backend)
+    extent_m = scene_extent(clean.trained.poses.cam_center_in_model)
+    fitted = refine_appearance(
+        cut, shown, order, backend, settings, rates=WITH_SHAPES, extent_m=extent_m, progress=progress
+    )
     return _showing(clean, fitted, backend)

@@ -1,4 +1,4 @@
-"""Appearance refinement: colours and opacities of Gaussians are fitted to images, while their geometry stays."""
+"""Refinement of Gaussians by images: of their appearance, while their geometry stays, or of both."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -22,6 +22,9 @@ from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 _RATES = LearningRates(
     means=0.0, means_final=0.0, quats_wxyz=0.0, log_scales=0.0, logit_opacities=0.05, sh_dc=0.01, sh_rest=0.002
 )
+# Rates at which shapes follow as well, after a part of the Gaussians has gone. Of those of a training, the centres'
+# is in scene extents.
+WITH_SHAPES = replace(_RATES, means=2.5e-4, means_final=2.5e-5, quats_wxyz=0.008, log_scales=0.04)
 _FALLS = ((0.8, 0.1), (0.5, 0.3), (0.0, 1.0))  # from this part of the work on, the rates have this factor
 
 
@@ -41,16 +44,19 @@ def refine_appearance(
     rasterizer: Rasterizer,
     settings: RasterSettings,
     *,
+    rates: LearningRates = _RATES,
+    extent_m: float = 1.0,
     progress: Progress = SILENT,
 ) -> Gaussians:
     """Return the Gaussians, on their own device, with colours and opacities that show the views.
 
     The order tells the number of a view for each iteration, the settings the degree of the harmonics. As in a
-    training, the background changes and transparency costs.
+    training, the background changes and transparency costs. Other rates move the geometry, too; that of the centres
+    is a part of the extent.
     """
     device = rasterizer.device
-    adam = GaussianAdam(gaussians.to(device), 1.0, len(order), _RATES)
-    with progress.task("appearance refinement", len(order)) as task:
+    adam = GaussianAdam(gaussians.to(device), extent_m, len(order), rates)
+    with progress.task("refinement", len(order)) as task:
         for iteration, number in enumerate(order):
             view = views(number)
             adam.rate_factor = next(factor for begin, factor in _FALLS if iteration >= begin * len(order))

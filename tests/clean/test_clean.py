@@ -165,7 +165,7 @@ def test_wire_that_stereo_misses_stays(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("most", [900, 1500])
 def test_number_is_obeyed_with_the_loss_stated(again: Littered, most: int) -> None:
-    record, reason = cleaned(again, gaussians=most, appearance_passes=2)
+    record, reason = cleaned(again, gaussians=most, refit_passes=2)
     assert record.cleaned == most == len(read_gaussians(again.workspace.path(CLEANED)))
     assert record.removed["consolidated"] == int((reason == CONSOLIDATED).sum()) > 0
     assert record.psnr_without_floaters is not None and record.psnr_cleaned is not None
@@ -176,7 +176,7 @@ def test_harmonics_are_limited_and_a_crop_is_taken(again: Littered, tmp_path: Pa
     trained = read_gaussians(again.workspace.path(GAUSSIANS))
     more = torch.cat([trained.sh, torch.full((len(trained), 15, 3), 0.1)], dim=1)
     write_gaussians(again.workspace.path(GAUSSIANS), Gaussians(**{**trained.tensors(), "sh": more}))
-    record, _ = cleaned(again, floaters=False, sh_degree=1, appearance_passes=0)
+    record, _ = cleaned(again, floaters=False, sh_degree=1, refit_passes=0)
     assert record.sh_degree == read_gaussians(again.workspace.path(CLEANED)).sh_degree == 1
     assert record.cleaned == len(trained) - TRANSPARENT_ONES
     assert not (again.workspace.root / REMOVED).exists()
@@ -192,7 +192,7 @@ def test_files_take_the_cleaned_model_in_the_same_place(again: Littered, caplog:
     workspace = again.workspace
     assert deliver(again, "export-ply")["model"] == "trained"
     before = load_json(GeorefSidecar, sidecar_path(workspace.path(SPLAT)))
-    cleaned(again, gaussians=800, appearance_passes=0)
+    cleaned(again, gaussians=800, refit_passes=0)
     assert deliver(again, "export-ply")["model"] == "cleaned"  # and so it was made again
     assert len(read_gaussians(workspace.path(SPLAT))) == 800
     assert load_json(GeorefSidecar, sidecar_path(workspace.path(SPLAT))).origin == before.origin
