@@ -22,10 +22,10 @@ log = logging.getLogger(__name__)
 # Seconds on two cores: of a run, of a photograph, and of a megapixel of the photographs as they are trained. `sfm`
 # and `train` have models of their own; these are rough, and the first run on a machine corrects them.
 _MODELS: dict[str, tuple[float, float, float]] = {
-    "ingest": (0.5, 0.02, 0.0),
-    "calibrate": (1.0, 0.05, 0.0),
-    "geolocate": (0.5, 0.04, 0.0),
-    "init-sim3": (1.0, 0.3, 0.0),
+    "ingest": (0.2, 0.01, 0.0),
+    "calibrate": (0.2, 0.006, 0.0),
+    "geolocate": (0.1, 0.007, 0.0),
+    "init-sim3": (0.3, 0.03, 0.0),
     "evaluate": (3.0, 0.1, 1.5),
     "export-ply": (0.1, 0.0, 0.01),
     "export-measurable": (3.0, 0.1, 4.0),
@@ -37,7 +37,7 @@ _MODELS: dict[str, tuple[float, float, float]] = {
     "export-html": (1.0, 0.0, 0.1),
     "export-cameras": (1.0, 0.02, 0.0),
     "export-opf": (1.0, 0.02, 0.0),
-    "report": (5.0, 0.1, 0.0),
+    "report": (2.5, 0.05, 0.0),
 }
 _KEPT = 5  # runs of a stage
 _MOST, _LEAST = 100.0, 0.01  # ratio, beyond which a file is damaged
