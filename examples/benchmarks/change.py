@@ -30,13 +30,13 @@ from scipy.ndimage import map_coordinates
 from pipelines.core.products import load_json
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.raster_plan import ground_sampling_m
 from pipelines.formats.geotiff import frame_of, read_cells
 from pipelines.formats.vector_files import feature, features_text
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef
 from pipelines.simulate.stage import TRUE_HEIGHTS, TRUTH
 from pipelines.simulate.truth import TrueChange, Truth
+from pipelines.survey.area import ground_sampling_m
 from pipelines.survey.change_report import Change
 from pipelines.survey.trained_survey import load_trained
 
@@ -165,7 +165,7 @@ def measured_pair(args: argparse.Namespace, seed: int, folder: Path) -> PairFigu
         regions_of_no_change=len(same.regions),
         volumes=tuple(_volume_errors(truth, truth.change, change, folder)),
         lod_m=change.median_lod_m,
-        gsd_m=ground_sampling_m(load_trained(Workspace(folder / "first")))[0],
+        gsd_m=ground_sampling_m(load_trained(Workspace(folder / "first"))),
         stable_shift_m=same.registration.shift_m,
         stable_sigma_m=None if same.common is None else (same.common.sigma_h_m, same.common.sigma_v_m),
         common_points=0 if same.common is None else same.common.used,
