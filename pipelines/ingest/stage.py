@@ -176,7 +176,8 @@ def _copy_images(survey: Survey, stage: StageRun) -> None:
 
 def _camera_list(survey: Survey) -> list[dict[str, Any]]:
     """Return the cameras of a survey: model, serial number, sensor, size, focal length, photographs, sharpness."""
-    images = Counter(image.camera_id for image in (*survey.images, *survey.companions))
+    images = Counter(image.camera_id for image in survey.images)
+    images.update(each.camera_id for each in survey.companions)
     sharp: dict[int, list[float]] = {}
     for image in survey.images:
         if image.sharpness is not None:

@@ -413,7 +413,7 @@ class Survey(Product):
     @model_validator(mode="after")
     def _belongs_together(self) -> Survey:
         names = {
-            "images": [image.name for image in (*self.images, *self.companions)],
+            "images": [image.name for image in self.images] + [each.name for each in self.companions],
             "control_points": [point.name for point in self.control_points],
             "check_points": [point.name for point in self.check_points],
             "unmarked_points": [point.name for point in self.unmarked_points],
@@ -423,7 +423,7 @@ class Survey(Product):
             if len(set(of_field)) != len(of_field):
                 raise ValueError(f"{field}: two have the same name")
         cameras = {camera.camera_id for camera in self.cameras}
-        everything = (*self.images, *self.companions)
+        everything: tuple[SurveyImage | Companion, ...] = (*self.images, *self.companions)
         lost = next((image for image in everything if image.camera_id not in cameras), None)
         if lost is not None:
             raise ValueError(f"images: {lost.name} has camera {lost.camera_id}, which is not among the cameras")
