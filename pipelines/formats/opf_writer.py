@@ -22,9 +22,9 @@ from pipelines import __version__
 from pipelines.core.files import replace_text
 from pipelines.core.products import dump_json
 from pipelines.core.types import FloatArray
+from pipelines.formats.camera_files import lens_of
 from pipelines.formats.opf_tracks import MATCHES
-from pipelines.geometry.cameras import Camera, distort, full_parameters, undistort
-from pipelines.geometry.lens_fit import FISHEYE
+from pipelines.geometry.cameras import Camera, distort, parameters_in, undistort
 from pipelines.geometry.rotations import omega_phi_kappa_deg
 from pipelines.geometry.sparse_model import SparseModel
 
@@ -162,23 +162,12 @@ def internals_of(camera: Camera) -> tuple[Json, float]:
     OPF's perspective lens has one focal length and a polynomial up to r⁶. Another lens is replaced by the one that
     least squares fits to it. A fisheye's angle up to θ⁹ is OPF's polynomial exactly.
     """
-    fx, fy, cx, cy, *terms = full_parameters(camera).tolist()
-    if camera.model == FISHEYE:
-        half = np.pi / 2
-        powers = [0.0, 1.0]
-        for order, term in enumerate(terms[:4], start=1):
-            powers += [0.0, term * half ** (2 * order)]
-        return {
-            "type": "fisheye",
-            "principal_point_px": [cx, cy],
-            "affine": [fx * half, 0.0, 0.0, fy * half],
-            "is_symmetric_affine": fx == fy,
-            "polynomial": powers,
-            "is_p0_zero": True,
-        }, 0.0
-    k1, k2, p1, p2, k3, *rational = terms
-    if fx == fy and not any(rational):
-        return _perspective(fx, (cx, cy), (k1, k2, k3), (p1, p2)), 0.0
+    if camera.model.endswith("FISHEYE"):
+        return _fisheye(camera)
+    full = parameters_in(camera, "FULL_OPENCV")
+    if full is not None and full[0] == full[1] and not full[9:].any():
+        focal, _, cx, cy, k1, k2, p1, p2, k3 = full[:9].tolist()
+        return _perspective(focal, (cx, cy), (k1, k2, k3), (p1, p2)), 0.0
     x, y = (np.linspace(0.0, side, _SAMPLES) for side in (camera.width, camera.height))
     rays = undistort(camera, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     rays = rays[np.isfinite(rays).all(axis=1)]
@@ -193,6 +182,25 @@ def internals_of(camera: Camera) -> tuple[Json, float]:
     error = (design @ solution - target.T.ravel()).reshape(2, -1)
     f, k1, k2, k3, p1, p2, cx, cy = (solution / np.array([1, *[solution[0]] * 5, 1, 1])).tolist()
     return _perspective(f, (cx, cy), (k1, k2, k3), (p1, p2)), float(np.hypot(*error).max())
+
+
+def _fisheye(camera: Camera) -> tuple[Json, float]:
+    """Return the fisheye nearest to a camera, as a polynomial of 2θ/π, and its largest error in pixels."""
+    lens = lens_of(camera)
+    fx, fy, cx, cy, *terms = (
+        lens.intrinsics[name] for name in ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4")
+    )
+    half, powers = np.pi / 2, [0.0, 1.0]
+    for order, term in enumerate(terms, start=1):
+        powers += [0.0, term * half ** (2 * order)]
+    return {
+        "type": "fisheye",
+        "principal_point_px": [cx, cy],
+        "affine": [fx * half, 0.0, 0.0, fy * half],
+        "is_symmetric_affine": fx == fy,
+        "polynomial": powers,
+        "is_p0_zero": True,
+    }, lens.error_px
 
 
 def _perspective(
