@@ -153,7 +153,7 @@ def _model_on_map(solved: SolvedSurvey, on_map: _Map, frame: OpfFrame) -> Sparse
     center = frame.processing(on_map.xyz(center_in_geo))
     # As the adjusted cameras see them; a point that they do not see at all is left out.
     points = refined_points(network_of(sparse, solved.poses, solved.point_in_model)).point_in_world
-    known: BoolArray = np.isfinite(points).all(axis=1)
+    known: BoolArray = np.asarray(np.isfinite(points).all(axis=1))
     place = np.cumsum(known) - 1
     seen = known[sparse.obs_point]
     return replace(

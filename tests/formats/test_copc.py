@@ -87,8 +87,9 @@ def test_levels_and_boxes_give_their_part(files: tuple[Path, Path]) -> None:
     cells = np.floor((first - every.min(axis=0)) / (SIDE_M.max() / 128) + 1e-9)
     assert 1000 < len(first) < COUNT and len(np.unique(cells, axis=0)) > 0.97 * len(first)
     assert (np.ptp(first, axis=0) > 0.98 * SIDE_M).all()
-    expected = (np.abs(every - middle) <= 5).all(axis=1)
-    assert len(inside) == expected.sum() > 100
+    least, most = ((np.abs(every - middle) <= 5 + off).all(axis=1).sum() for off in (-1e-3, 1e-3))  # its steps
+    assert 100 < least <= len(inside) <= most
+    assert (np.abs(inside - middle) <= 5.001).all()
 
 
 def test_few_points_are_one_node(tmp_path: Path) -> None:
