@@ -115,7 +115,9 @@ def mesh_of(town: Town, half_m: float = 24.0) -> trimesh.Trimesh:
     boxes = [trimesh.creation.box(bounds=np.stack(box)) for box in town.boxes]
     corners = np.array([[-half_m, -half_m, 0], [half_m, -half_m, 0], [half_m, half_m, 0], [-half_m, half_m, 0]])
     ground = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
-    return trimesh.util.concatenate([ground, *boxes])
+    whole = trimesh.util.concatenate([ground, *boxes])
+    assert isinstance(whole, trimesh.Trimesh)
+    return whole
 
 
 def distance_to(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
@@ -125,7 +127,7 @@ def distance_to(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
     slack = 0.01
     low, high = triangles.min(axis=1) - slack, triangles.max(axis=1) + slack
     inside = ((points[:, None] >= low) & (points[:, None] <= high)).all(axis=2)
-    return np.where(inside, off, np.inf).min(axis=1)
+    return np.asarray(np.where(inside, off, np.inf).min(axis=1))
 
 
 def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:

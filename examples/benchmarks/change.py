@@ -165,7 +165,7 @@ def measured_pair(args: argparse.Namespace, seed: int, folder: Path) -> PairFigu
         regions_of_no_change=len(same.regions),
         volumes=tuple(_volume_errors(truth, truth.change, change, folder)),
         lod_m=change.median_lod_m,
-        gsd_m=ground_sampling_m(load_trained(Workspace(folder / "first"))),
+        gsd_m=ground_sampling_m(load_trained(Workspace(folder / "first"))) or float("nan"),
         stable_shift_m=same.registration.shift_m,
         stable_sigma_m=None if same.common is None else (same.common.sigma_h_m, same.common.sigma_v_m),
         common_points=0 if same.common is None else same.common.used,

@@ -210,7 +210,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "Which stages": ("first", "force", "forget", "settings", "as_json"),
     "Photographs": (
         "sensor", "bag", "video", "image_topic", "fix_topic", "attitude_topic", "every", "skip_blurred", "focal_px",
-        "rolling_shutter", "masks", "mask", "mask_sky", "copy_images", "test_every",
+        "rolling_shutter", "rig", "masks", "mask", "mask_sky", "copy_images", "test_every",
     ),
     "Positions and attitudes": (
         "geo", "events", "origin", "ground_height", "time_offset", "estimate", "lever_arm", "camera_mount",
