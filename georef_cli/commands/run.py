@@ -223,7 +223,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     ),
     "Required accuracy": ("tolerance_h", "tolerance_v"),
     "Reconstruction and training": (
-        "mapper", "import_model", "triangulate", *_EFFORT, "backend", "seed", *_LIDAR,
+        "mapper", "import_model", "triangulate", "earlier", *_EFFORT, "backend", "seed", *_LIDAR,
     ),
     "Area": (*AreaOptions.model_fields, "fill"),
 }  # fmt: skip
