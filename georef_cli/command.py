@@ -71,7 +71,7 @@ def shared_options() -> list[click.Option]:
             metavar="N",
             expose_value=False,
             callback=_limit_threads,
-            help="Use at most this many threads (default: one for each core).",
+            help="Use at most so many threads (default: one a core).",
         ),
     ]
 

@@ -154,7 +154,6 @@ def cli() -> None:
     \b
     Examples:
       georef run flight --images photos
-      georef status flight
       georef help start
     """
 

@@ -45,7 +45,7 @@ _LIDAR = (
 _IN_AREA = (
     "train",
     "evaluate",
-    *(f"export-{name}" for name in ("ply", "measurable", "raster", "cloud", "mesh", "spz", "tiles")),
+    *(f"export-{name}" for name in ("ply", "measurable", "raster", "cloud", "mesh", "spz", "tiles", "html")),
 )
 LATER: dict[str, tuple[str, ...]] = {
     "mapper": ("sfm",),
@@ -194,7 +194,8 @@ def _flags(
         if not owners:
             flag = options.stage_option(BY_NAME[OWNERS[name][0]].options, name).opts[0]
             owned = " and ".join(OWNERS[name])
-            if last is None or any(PIPELINE.index(BY_NAME[owner]) < last for owner in OWNERS[name]):
+            before = [spec.name for spec in PIPELINE[:last]]
+            if last is None or set(before) & set(OWNERS[name]):
                 raise click.UsageError(f"{flag} is for {owned}, which is not among the stages to run.")
             log.warning(options.NOT_REACHED, flag, owned, extra={"code": "option-not-used"})
         for owner in owners:

@@ -120,7 +120,8 @@ def splat_values(splat: PlacedSplat | SplatParts) -> dict[str, object]:
 def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
     """Return the splat of a workspace, placed on Earth; a DegenerateGeometryError: no Gaussian is opaque enough."""
     path, origin = model_to_deliver(workspace, options)
-    splat = placed_splat(read_gaussians(path), _trained_placement(workspace), options, crop_of(workspace, options))
+    placement = _trained_placement(workspace)
+    splat = placed_splat(read_gaussians(path), placement, options, crop_of(workspace, options))
     return replace(splat, model=origin, mip_filter=load_json(TrainedModel, workspace.path(MODEL)).mip_filter)
 
 

@@ -12,7 +12,7 @@ from pipelines.core.errors import ConvergenceError
 from pipelines.core.machine import chosen_threads, thread_count
 from pipelines.core.options import read_requests
 from pipelines.core.products import Remark
-from pipelines.core.stages import BY_NAME, PIPELINE, stage_slice
+from pipelines.core.stages import BY_NAME, DELIVERABLES, PIPELINE, stage_slice
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.survey.options import AreaOptions
 from tests import fakes
@@ -341,5 +341,13 @@ class TestTalk:
 
 def test_run_hands_a_boundary_to_every_stage_that_ends_at_it() -> None:
     assert set(LATER["boundary"]) == {
-        name for name, spec in BY_NAME.items() if issubclass(spec.options, AreaOptions)
+        spec.name for spec in (*PIPELINE, *DELIVERABLES) if issubclass(spec.options, AreaOptions)
     }
+
+
+def test_an_option_of_later_stages_is_told_where_they_do_not_run(georef: Georef, tmp_path: Path, photos: Path) -> None:
+    """A boundary is for train and deliverables: a run to sfm says that it is not used, and runs."""
+    (tmp_path / "field.geojson").write_text("{}")
+    result = georef("run", tmp_path / "ws", "--images", photos, "--to", "sfm", "--boundary", tmp_path / "field.geojson")
+    assert result.code == 0, result.err
+    assert "--boundary" in result.err
