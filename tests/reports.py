@@ -8,7 +8,7 @@ from typing import Any
 from pipelines.core.products import Remark, save_json
 from pipelines.core.stages import REPORT
 from pipelines.core.workspace import Workspace
-from pipelines.robust.statistics import ResidualStats
+from pipelines.geometry.statistics import ResidualStats
 from pipelines.survey.headline import headline
 from pipelines.survey.report import (
     AccuracySummary,

@@ -24,7 +24,7 @@ PACKAGES = ("georef_cli", "pipelines")
 # each other as long as no circle arises; stage rooms never do: they meet in the workspace.
 FLOORS: tuple[tuple[str, ...], ...] = (
     ("pipelines.core",),
-    ("pipelines.geodesy", "pipelines.geometry", "pipelines.robust"),
+    ("pipelines.geodesy", "pipelines.geometry"),
     ("pipelines.formats",),
     ("pipelines.splat", "pipelines.survey"),
     # The adjustment, with calibrate, geolocate and init-sim3, which are its steps.

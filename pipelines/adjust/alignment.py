@@ -34,9 +34,9 @@ from scipy.optimize import brentq
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, Rows, joined_rows, rows_of
+from pipelines.geometry import statistics
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation, umeyama
-from pipelines.robust import statistics
 
 OUTLIER_GATE = statistics.outlier_gate(3)
 _LEAST_FOR_EXCESS = 5  # points of a kind; the scatter of fewer is too uncertain

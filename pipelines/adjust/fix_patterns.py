@@ -28,7 +28,7 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.statistics import cauchy_weight, outlier_gate
+from pipelines.geometry.statistics import cauchy_weight, outlier_gate
 from pipelines.survey.survey import Survey
 
 _LEAST_IMAGES = 8

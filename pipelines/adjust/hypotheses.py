@@ -24,9 +24,9 @@ from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef, lla_from_enu
 from pipelines.geodesy.vertical import FOOT_M
+from pipelines.geometry import statistics
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust import statistics
 from pipelines.survey.survey import Survey
 
 # A hypothesis explains an inconsistency if it lowers the scatter by so much.

@@ -39,7 +39,7 @@ from pipelines.core.types import FloatArray
 from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.statistics import median_spacing, outlier_gate, typical_sigma
+from pipelines.geometry.statistics import median_spacing, outlier_gate, typical_sigma
 from pipelines.survey.report_parts import EstimatedError, Group, VarianceFactor
 from pipelines.survey.survey import Survey
 

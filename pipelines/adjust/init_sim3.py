@@ -63,7 +63,7 @@ from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.similarity import Similarity, SimilarityRecord, jacobian_at, spread_ratio_similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.statistics import ResidualStats, residual_stats, squared_mahalanobis
+from pipelines.geometry.statistics import ResidualStats, residual_stats, squared_mahalanobis
 from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import of_wrong_marks, wrong_marks

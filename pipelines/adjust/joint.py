@@ -28,7 +28,7 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.statistics import chi2_probability_above, median_chi2, outlier_gate
+from pipelines.geometry.statistics import chi2_probability_above, median_chi2, outlier_gate
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.marks import RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.survey.report_parts import (

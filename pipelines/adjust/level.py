@@ -20,7 +20,7 @@ from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.statistics import cauchy_weight
+from pipelines.geometry.statistics import cauchy_weight
 from pipelines.survey.survey import Survey
 
 _LEAST_CAMERAS, _POINTS = 4, 20_000

@@ -22,7 +22,7 @@ from pipelines.core.sentences import listed
 from pipelines.core.types import FloatArray
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.statistics import residual_stats
+from pipelines.geometry.statistics import residual_stats
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.survey import Survey

@@ -27,8 +27,8 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, perturbation, umeyama
+from pipelines.geometry.statistics import cauchy_weight, mad_sigma, median_chi2, squared_mahalanobis
 from pipelines.geometry.trajectory import Trajectory
-from pipelines.robust.statistics import cauchy_weight, mad_sigma, median_chi2, squared_mahalanobis
 
 # Columns of the parameters: similarity (ln s, rotation, translation), offset in s, boresight in rad, arm in m.
 SIMILARITY, OFFSET, BORESIGHT, ARM = slice(0, 7), slice(7, 8), slice(8, 11), slice(11, 14)

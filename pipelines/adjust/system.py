@@ -33,7 +33,7 @@ from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import skew
 from pipelines.geometry.similarity import perturbation
 from pipelines.geometry.sparse_cholesky import SparseCholesky
-from pipelines.robust.statistics import NOISE_WEIGHT, cauchy_loss, cauchy_weight
+from pipelines.geometry.statistics import NOISE_WEIGHT, cauchy_loss, cauchy_weight
 from pipelines.survey.trained_model import EarlierDate
 
 _ROUNDS = 150

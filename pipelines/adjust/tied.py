@@ -14,7 +14,7 @@ from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.statistics import RansacOptions, cauchy_weight, mad_sigma, ransac
+from pipelines.geometry.statistics import RansacOptions, cauchy_weight, mad_sigma, ransac
 from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.survey import Survey
 

@@ -17,7 +17,7 @@ from scipy.ndimage import label, uniform_filter
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
-from pipelines.robust.statistics import huber_weight, mad_sigma
+from pipelines.geometry.statistics import huber_weight, mad_sigma
 
 QUANTILE_95 = 1.96
 LAGS = (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90)  # cells between the members of a pair

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from pipelines.core.figures import ToleranceTest, length_text
 from pipelines.core.types import BoolArray, FloatArray
-from pipelines.robust.statistics import residual_stats
+from pipelines.geometry.statistics import residual_stats
 from pipelines.survey.report import AsprsStatement, ErrorStats, Rmse, TotalRmse, VegetatedAccuracy
 
 STANDARD = "ASPRS, Edition 2, Version 2, 2024"

@@ -19,7 +19,7 @@ from pipelines.core.sentences import listed
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.evaluate.asprs import Assessment, assess
 from pipelines.evaluate.blunders import blunder_caution, find_blunders
-from pipelines.robust.statistics import chi2_quantile, residual_stats
+from pipelines.geometry.statistics import chi2_quantile, residual_stats
 from pipelines.surface.picking import DepthMap, depth_around, points_on_surface
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey import report

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray, joined_rows, rows_of
 from pipelines.geometry.footprints import first_of_voxels
-from pipelines.robust.statistics import NORMAL_MAD
+from pipelines.geometry.statistics import NORMAL_MAD
 from pipelines.surface.m3c2 import CONFIDENCE_95, Square, TiledPoints, at_random, m3c2, oriented_normals
 from pipelines.surface.visibility import SeenSurface
 from pipelines.survey.report_parts import CloudDistances, M3c2Figures, ReferenceGroup, SurfaceScore

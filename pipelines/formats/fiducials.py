@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from pipelines.core.types import ByteArray, FloatArray
-from pipelines.robust.statistics import NORMAL_MAD
+from pipelines.geometry.statistics import NORMAL_MAD
 
 LEAST_SIDE_PX = 12.0  # of a tag that is looked for: a module of the smallest dictionary has two pixels then
 # A side leaves out its ends, where the other sides blur it.

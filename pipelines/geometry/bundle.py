@@ -26,7 +26,7 @@ from pipelines.geometry.network import (
 from pipelines.geometry.rotations import skew
 from pipelines.geometry.row_motion import RowMotion, with_row_motion
 from pipelines.geometry.similarity import Similarity
-from pipelines.robust.statistics import CAUCHY_SCALE2, cauchy_weight, rayleigh_sigma
+from pipelines.geometry.statistics import CAUCHY_SCALE2, cauchy_weight, rayleigh_sigma
 
 
 def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:

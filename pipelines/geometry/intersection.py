@@ -28,7 +28,7 @@ from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import project_each
 from pipelines.geometry.network import Network, chunks_of_points, projection_residuals
 from pipelines.geometry.rotations import skew
-from pipelines.robust.statistics import cauchy_loss, cauchy_weight, chi2_quantile, huber_weight
+from pipelines.geometry.statistics import cauchy_loss, cauchy_weight, chi2_quantile, huber_weight
 
 
 @dataclass(frozen=True)

@@ -29,13 +29,19 @@ from pipelines.geodesy.vertical import (
     VerticalDatum,
     impossible_heights,
 )
+from pipelines.geometry.statistics import (
+    blunders_among,
+    mad_sigma,
+    median_spacing,
+    scatter_about_median,
+    two_groups,
+)
 from pipelines.ingest.flight_record import COMMON_SIGMA_M, ImagePoses, kind_of_receiver, with_defaults
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.tag_headings import tagged_attitudes
 from pipelines.ingest.tag_positions import tagged_positions
-from pipelines.robust.statistics import blunders_among, mad_sigma, median_spacing, scatter_about_median, two_groups
 
 # Vertical over horizontal σ of a fix that states only the horizontal one.
 _VERTICAL_RATIO = 2.0

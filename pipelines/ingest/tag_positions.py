@@ -25,6 +25,7 @@ from pipelines.formats.exif import GpsTag
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.crs_names import code_of_name
 from pipelines.geodesy.vertical import FOOT_M
+from pipelines.geometry.statistics import scatter_about_median
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.reference_system import note_operation
 from pipelines.ingest.remarks import Remarks, shortened
@@ -36,7 +37,6 @@ from pipelines.ingest.written_values import (
     step_of_places,
     zero_heights,
 )
-from pipelines.robust.statistics import scatter_about_median
 
 _FINE_M = 0.1  # a step that no σ of a plain receiver notices
 _SLACK_M = 0.02

@@ -12,8 +12,8 @@ from typing import Literal
 from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.sentences import listed
 from pipelines.core.types import Vector3
+from pipelines.geometry.statistics import NORMAL_MAD
 from pipelines.report.page import decibel, number_text, share
-from pipelines.robust.statistics import NORMAL_MAD
 from pipelines.survey.report import (
     CheckPointErrors,
     CheckPoints,

@@ -29,7 +29,7 @@ from pipelines.core.types import FloatArray, Vector3
 from pipelines.formats.colmap import flatten
 from pipelines.geometry.cameras import project_each
 from pipelines.geometry.similarity import Similarity, umeyama
-from pipelines.robust.statistics import CAUCHY_95, CAUCHY_SCALE2, cauchy_weight, median_chi2, rayleigh_sigma
+from pipelines.geometry.statistics import CAUCHY_95, CAUCHY_SCALE2, cauchy_weight, median_chi2, rayleigh_sigma
 
 log = logging.getLogger(__name__)
 

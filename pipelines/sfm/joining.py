@@ -16,7 +16,7 @@ import numpy as np
 
 from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress, ProgressTask
-from pipelines.robust.statistics import CAUCHY_95
+from pipelines.geometry.statistics import CAUCHY_95
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.mapping import MapperRun, lens_of, run_mapper, scratch_beside
 from pipelines.sfm.match_ties import Tie, side_of, tie

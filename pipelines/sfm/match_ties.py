@@ -21,7 +21,7 @@ import numpy as np
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import Camera, bearings, project_each
 from pipelines.geometry.similarity import Similarity, covariance_at, perturbation
-from pipelines.robust.statistics import CAUCHY_95, NORMAL_MAD, cauchy_weight
+from pipelines.geometry.statistics import CAUCHY_95, NORMAL_MAD, cauchy_weight
 
 _FEWEST_POINTS = 4  # of the model, and of a part that has a scale: one gives the scale, the others check it
 _FEWEST_MATCHES = 30  # COLMAP's fewest points by which it adds a photograph

@@ -28,7 +28,7 @@ from pipelines.formats.colmap import load_reconstruction, quiet_colmap, read_spa
 from pipelines.geometry.cameras import pycolmap_module
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.robust.statistics import residual_stats
+from pipelines.geometry.statistics import residual_stats
 from pipelines.sfm.adjustment import position_adjuster
 from pipelines.sfm.options import AdjustOptions
 from pipelines.survey.adjustment import InitialSimilarity

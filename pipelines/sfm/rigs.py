@@ -24,7 +24,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.types import FloatArray
 from pipelines.formats.colmap import flatten, reconstruction_of
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw
-from pipelines.robust.statistics import CAUCHY_95
+from pipelines.geometry.statistics import CAUCHY_95
 from pipelines.sfm.adjustment import alignment_with, hold_lenses_in_place
 from pipelines.sfm.colmap_database import copy_database, remove_database
 from pipelines.sfm.features import SfmJob

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from pipelines.core.types import Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
-from pipelines.robust.statistics import cauchy_weight, median_chi2
+from pipelines.geometry.statistics import cauchy_weight, median_chi2
 
 _FIRST_RATE, _LAST_RATE = 5e-3, 5e-4
 VIGNETTING_TERMS = 3  # of r², r⁴, r⁶

@@ -19,7 +19,7 @@ from pipelines.core.machine import thread_count
 from pipelines.core.types import BoolArray, Float32Array, FloatArray
 from pipelines.geometry.cameras import ViewPose
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
-from pipelines.robust.statistics import NORMAL_MAD
+from pipelines.geometry.statistics import NORMAL_MAD
 from pipelines.splat.gaussians import Gaussians
 
 # σ of a measured depth, as a part of it: views of one surface agree within 2 % (`agreement.FREE`), which is 4 σ.

@@ -26,7 +26,7 @@ from pipelines.core.types import Float32Array, FloatArray
 from pipelines.formats.depth_image import DEPTH_SUFFIXES, read_depth_image
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.cameras import undistort
-from pipelines.robust.statistics import mad_sigma
+from pipelines.geometry.statistics import mad_sigma
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.measured_cloud import MeasuredCloud, ReadTally, Thinning, suffixes_in
 from pipelines.survey.options import CLOUD_SUFFIXES

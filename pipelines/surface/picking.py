@@ -13,7 +13,7 @@ import numpy as np
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.geometry.rotations import rotation_towards
-from pipelines.robust.statistics import spatial_median
+from pipelines.geometry.statistics import spatial_median
 from pipelines.splat.rasterizer.api import Window
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import MarkRays

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray, rows_of
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation
-from pipelines.robust.statistics import cauchy_weight, mad_sigma
+from pipelines.geometry.statistics import cauchy_weight, mad_sigma
 from pipelines.surface.lidar_cloud import LidarCloud
 from pipelines.surface.visibility import DepthViews, Support, support
 from pipelines.survey.report_parts import Alignment, ReferenceShift

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipelines.core.products import ArrayProduct, Product, Remark
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.similarity import SimilarityRecord
-from pipelines.robust.statistics import ResidualStats
+from pipelines.geometry.statistics import ResidualStats
 from pipelines.survey.report_parts import (
     VarianceFactor,
     applied_factors,

@@ -13,7 +13,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline, ToleranceTest
 from pipelines.core.products import ImageName, Product, Remark, load_json
 from pipelines.core.types import Vector3
-from pipelines.robust.statistics import ResidualStats
+from pipelines.geometry.statistics import ResidualStats
 from pipelines.survey.report_parts import ReferenceComparison, VarianceFactor
 
 

@@ -19,8 +19,8 @@ from pipelines.core.progress import Progress
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.similarity import Similarity, SimilarityRecord, covariance_at
+from pipelines.geometry.statistics import mad_sigma
 from pipelines.report.plots.maps import DrawnArea, write_lidar_map
-from pipelines.robust.statistics import mad_sigma
 from pipelines.splat.losses import FreeSpace
 from pipelines.surface.crossings import count_beams
 from pipelines.surface.depth_maps import DepthMaps

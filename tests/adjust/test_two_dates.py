@@ -11,7 +11,7 @@ import pytest
 
 from pipelines.adjust.relative import Relative, relative
 from pipelines.geodesy.enu import Origin, ecef_from_enu_rotation, lla_of
-from pipelines.robust.statistics import outlier_gate
+from pipelines.geometry.statistics import outlier_gate
 from tests.two_dates import ASIDE, CHECK, COMMON, CONSUMER, HERE, RTK, Date, Receiver, common_of, draw_date, ground
 
 pytestmark = pytest.mark.usefixtures("one_thread")

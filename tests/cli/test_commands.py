@@ -345,9 +345,10 @@ def test_run_hands_a_boundary_to_every_stage_that_ends_at_it() -> None:
     }
 
 
-def test_an_option_of_later_stages_is_told_where_they_do_not_run(georef: Georef, tmp_path: Path, photos: Path) -> None:
+def test_an_option_of_later_stages_is_told(georef: Georef, tmp_path: Path, photos: Path) -> None:
     """A boundary is for train and deliverables: a run to sfm says that it is not used, and runs."""
-    (tmp_path / "field.geojson").write_text("{}")
-    result = georef("run", tmp_path / "ws", "--images", photos, "--to", "sfm", "--boundary", tmp_path / "field.geojson")
+    field = tmp_path / "field.geojson"
+    field.write_text("{}")
+    result = georef("run", tmp_path / "ws", "--images", photos, "--to", "sfm", "--boundary", field)
     assert result.code == 0, result.err
     assert "--boundary" in result.err

@@ -12,7 +12,7 @@ from pipelines.geometry import intersection as module
 from pipelines.geometry.cameras import project
 from pipelines.geometry.intersection import refined_points
 from pipelines.geometry.network import Network
-from pipelines.robust.statistics import cauchy_loss
+from pipelines.geometry.statistics import cauchy_loss
 from tests.bundle_scenes import exact_network, noisy
 
 EXACT = exact_network(images=6)

@@ -27,7 +27,7 @@ from pipelines.core.workspace import Summary
 from pipelines.formats.colmap import read_sparse
 from pipelines.formats.splat_ply import join_splat_plys
 from pipelines.geometry.cameras import pose_matrix
-from pipelines.robust.statistics import mad_sigma
+from pipelines.geometry.statistics import mad_sigma
 from pipelines.splat.gaussians import Gaussians, read_gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer

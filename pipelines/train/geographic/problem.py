@@ -21,7 +21,7 @@ from pipelines.adjust.state import State, SystematicErrors
 from pipelines.adjust.system import Problem
 from pipelines.geometry.bundle import bundle_information, coordinates_of, correction_basis
 from pipelines.geometry.cameras import Pinhole
-from pipelines.robust.statistics import MEAN_WEIGHTED_CHI2
+from pipelines.geometry.statistics import MEAN_WEIGHTED_CHI2
 from pipelines.splat.surface import depth_at
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.train.adjusted_scene import AdjustedScene

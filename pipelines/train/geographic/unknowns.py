@@ -13,7 +13,7 @@ from pipelines.adjust.state import ErrorName, State, SystematicErrors
 from pipelines.core.types import FloatArray
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity, perturbation
-from pipelines.robust.statistics import CAUCHY_SCALE2
+from pipelines.geometry.statistics import CAUCHY_SCALE2
 
 
 def exp_so3_tensor(rotation_vector: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from pipelines.adjust.options import GeolocateOptions, InitSim3Options
 from pipelines.adjust.posterior import Posterior
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.geometry.bundle import predicted_basis_bytes
-from pipelines.robust.statistics import CAUCHY_SCALE2
+from pipelines.geometry.statistics import CAUCHY_SCALE2
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.scene import adjusted_scene
 from pipelines.survey.survey import Survey

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import chi2
 
-from pipelines.robust.statistics import (
+from pipelines.geometry.statistics import (
     CAUCHY_SCALE2,
     MEAN_WEIGHTED_CHI2,
     NOISE_WEIGHT,

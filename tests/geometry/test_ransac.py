@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.robust.statistics import RansacOptions, draws_needed, ransac
+from pipelines.geometry.statistics import RansacOptions, draws_needed, ransac
 from tests.refusals import numbers, refused
 
 OPTIONS = RansacOptions(sample_size=2, gate=9.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.robust.statistics import blunders_among, scatter_about_median, two_groups
+from pipelines.geometry.statistics import blunders_among, scatter_about_median, two_groups
 
 COUNT, SIGMA = 40, 0.02
 

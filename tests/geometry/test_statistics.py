@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from pipelines.geometry.rotations import exp_so3
-from pipelines.robust.statistics import (
+from pipelines.geometry.statistics import (
     chi2_quantile,
     mad_sigma,
     rayleigh_sigma,

@@ -1,1 +1,0 @@
-"""Robust kernels, RANSAC and statistics (numpy, float64)."""
