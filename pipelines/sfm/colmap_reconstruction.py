@@ -23,7 +23,7 @@ from pipelines.sfm.mapping import triangulate
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.rigs import reference_alone, with_rigs
 from pipelines.sfm.rolling_shutter import correct_tie_points
-from pipelines.sfm.rounds import align
+from pipelines.sfm.rounds import map_in_rounds
 from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)
@@ -99,7 +99,7 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> tuple[Any, bool
     Raises as `reconstruct`. A held lens stays as stated in every later adjustment, too.
     """
     colmap.set_random_seed(job.options.seed)
-    aligned = align(colmap, job, progress)
+    aligned = map_in_rounds(colmap, job, progress)
     if not aligned.models:
         raise DegenerateGeometryError(
             "no-matches",

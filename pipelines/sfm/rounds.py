@@ -36,7 +36,7 @@ _MOST_LEARNED_PAIRS = 4000  # hours on two cores
 
 
 @dataclass(frozen=True)
-class Alignment:
+class MappedModels:
     """The models of a round, the largest first, and how they were made."""
 
     models: list[Any]
@@ -52,20 +52,20 @@ class Alignment:
         return len({image_id for model in self.models for image_id in model.reg_image_ids()})
 
 
-def align(colmap: Any, job: SfmJob, progress: Progress) -> Alignment:
+def map_in_rounds(colmap: Any, job: SfmJob, progress: Progress) -> MappedModels:
     """Return the models of a database with features and matches after as many rounds as they need.
 
     The first model is the largest, with those beside it that positions place; none: no two photographs match.
     """
     if job.options.features == "learned":
         _add_learned(colmap, job, candidate_pairs(job.survey, job.options), progress)
-    best = Alignment(*map_database(colmap, job, progress))
+    best = MappedModels(*map_database(colmap, job, progress))
     best = _with_lens_held(colmap, job, best, progress)
     best, joins = _joined_by_matches(colmap, job, best, progress)
     if not _whole(best, job.survey) and job.options.features == "auto" and missing_for_learned() is None:
         pairs = _pairs_to_add(colmap, job, best)
         if len(pairs) and _add_learned(colmap, job, pairs, progress):
-            again = Alignment(*map_database(colmap, job, progress, lens_held=best.lens_held), best.lens_held)
+            again = MappedModels(*map_database(colmap, job, progress, lens_held=best.lens_held), best.lens_held)
             again, joins_again = _joined_by_matches(colmap, job, again, progress)
             if _merit(again) > _merit(best):
                 best, joins = again, joins_again
@@ -80,20 +80,20 @@ def align(colmap: Any, job: SfmJob, progress: Progress) -> Alignment:
 
 
 def _joined_by_matches(
-    colmap: Any, job: SfmJob, alignment: Alignment, progress: Progress
-) -> tuple[Alignment, tuple[Join, ...]]:
-    """Return an alignment whose largest model has what its matches tie to it.
+    colmap: Any, job: SfmJob, mapped: MappedModels, progress: Progress
+) -> tuple[MappedModels, tuple[Join, ...]]:
+    """Return the models, of which the largest has what its matches tie to it.
 
     The global mapper's model has too few points for that, and leaves out one photograph of twenty at most.
     """
-    if not alignment.models or alignment.mapper == "global":
-        return alignment, ()
-    largest, joins = join_by_matches(colmap, job, alignment.models[0], progress)
-    return replace(alignment, models=[largest, *alignment.models[1:]]), joins
+    if not mapped.models or mapped.mapper == "global":
+        return mapped, ()
+    largest, joins = join_by_matches(colmap, job, mapped.models[0], progress)
+    return replace(mapped, models=[largest, *mapped.models[1:]]), joins
 
 
-def _with_lens_held(colmap: Any, job: SfmJob, free: Alignment, progress: Progress) -> Alignment:
-    """Return the better of an alignment and one with the lens held, where the first has a reason to doubt it."""
+def _with_lens_held(colmap: Any, job: SfmJob, free: MappedModels, progress: Progress) -> MappedModels:
+    """Return the better of the models and those with the lens held, where the first has a reason to doubt it."""
     if not free.models:
         return free
     astray = lenses_astray(free.models[0], job.survey)
@@ -104,7 +104,7 @@ def _with_lens_held(colmap: Any, job: SfmJob, free: Alignment, progress: Progres
         log.info("The model of %d photographs is solved again with the lens held: %s.", free.registered, why)
     with lens_of(colmap, job.database, _sound_lens(free, job.survey)):
         models, mapper = map_database(colmap, job, progress, lens_held=True)
-    held = Alignment(models, mapper, lens_held=True)
+    held = MappedModels(models, mapper, lens_held=True)
     as_many = held.covered() >= free.covered() and held.registered >= free.registered
     if astray and as_many and _error_px(held) <= _FITS_AS_WELL * _error_px(free):
         return held
@@ -112,30 +112,30 @@ def _with_lens_held(colmap: Any, job: SfmJob, free: Alignment, progress: Progres
     return held if _merit(held) > _merit(free) else free
 
 
-def _error_px(alignment: Alignment) -> float:
-    return float(alignment.models[0].compute_mean_reprojection_error())
+def _error_px(mapped: MappedModels) -> float:
+    return float(mapped.models[0].compute_mean_reprojection_error())
 
 
-def _merit(alignment: Alignment) -> tuple[int, int]:
-    return alignment.registered, alignment.covered()
+def _merit(mapped: MappedModels) -> tuple[int, int]:
+    return mapped.registered, mapped.covered()
 
 
-def _whole(alignment: Alignment, survey: Survey) -> bool:
-    return alignment.registered >= _WHOLE * len(survey.images)
+def _whole(mapped: MappedModels, survey: Survey) -> bool:
+    return mapped.registered >= _WHOLE * len(survey.images)
 
 
-def _sound_lens(alignment: Alignment, survey: Survey) -> dict[int, Any]:
+def _sound_lens(mapped: MappedModels, survey: Survey) -> dict[int, Any]:
     """Return the cameras of the largest model that determines sound ones; none: no model does."""
-    for model in alignment.models:
+    for model in mapped.models:
         if model.num_reg_images() >= _FEWEST_FOR_LENS and not lenses_astray(model, survey):
             used = {model.images[image_id].camera_id for image_id in model.reg_image_ids()}
             return {camera_id: model.cameras[camera_id].params.copy() for camera_id in used}
     return {}
 
 
-def _pairs_to_add(colmap: Any, job: SfmJob, alignment: Alignment) -> IntArray:
+def _pairs_to_add(colmap: Any, job: SfmJob, mapped: MappedModels) -> IntArray:
     """Return the pairs (P, 2) that learned features may connect: of photographs apart, with few matches so far."""
-    apart = set(range(len(job.survey.images))) - {i - 1 for i in alignment.models[0].reg_image_ids()}
+    apart = set(range(len(job.survey.images))) - {i - 1 for i in mapped.models[0].reg_image_ids()}
     matched = verified_matches(colmap, job.database)
     candidates = candidate_pairs(job.survey, job.options).tolist()
     wanted = [
@@ -160,10 +160,10 @@ def _add_learned(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress) 
     return add_learned(colmap, job, pairs, progress)
 
 
-def _tell_of_ties(alignment: Alignment, joins: tuple[Join, ...]) -> None:
+def _tell_of_ties(mapped: MappedModels, joins: tuple[Join, ...]) -> None:
     if not joins:
         return
-    images = alignment.models[0].images
+    images = mapped.models[0].images
     count = sum(len(join.images) for join in joins)
     each = "; ".join(
         f"{', '.join(images[image_id].name for image_id in join.images[:_MOST_NAMED])}"
@@ -178,11 +178,11 @@ def _tell_of_ties(alignment: Alignment, joins: tuple[Join, ...]) -> None:
     )  # fmt: skip
 
 
-def _tell_of_parts(alignment: Alignment, photographs: int) -> None:
-    sizes = [model.num_reg_images() for model in alignment.models]
+def _tell_of_parts(mapped: MappedModels, photographs: int) -> None:
+    sizes = [model.num_reg_images() for model in mapped.models]
     log.info(
         "The survey fell apart into %d models of %s images; the largest has %d of %d photographs.",
-        len(sizes), ", ".join(map(str, sizes)), alignment.registered, photographs,
+        len(sizes), ", ".join(map(str, sizes)), mapped.registered, photographs,
     )  # fmt: skip
 
 

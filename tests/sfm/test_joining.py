@@ -84,6 +84,6 @@ def test_a_strip_of_matches_joins_what_lies_beyond(
     sigma_m = HEIGHT_M * max(join.tie.sigma for join in joins)
     assert sigma_m < 0.1
     assert error_beyond(whole, center).max() < 4 * sigma_m
-    aligned = rounds.align(pycolmap, job, SILENT)
+    aligned = rounds.map_in_rounds(pycolmap, job, SILENT)
     assert aligned.registered == len(center)
     assert logged_codes(caplog) == ["joined-by-matches"]

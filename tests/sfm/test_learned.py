@@ -19,7 +19,7 @@ from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
 from pipelines.sfm import colmap_reconstruction, learned_weights
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.learned_features import LearnedFeatures, LearnedMatcher, quarters_to_north
-from pipelines.sfm.rounds import Alignment
+from pipelines.sfm.rounds import MappedModels
 from pipelines.survey.survey import Attitude, SurveyImage
 from tests.refusals import refused
 from tests.sfm_scenes import CONFIG, Photographs, survey_of
@@ -152,7 +152,7 @@ def test_photographs_without_matches_are_told_of_learned_features(
     features: Literal["auto", "sift"], cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = job_of(tmp_path, ["a.jpg", "b.jpg"])
-    monkeypatch.setattr(colmap_reconstruction, "align", lambda *_: Alignment([], "incremental"))
+    monkeypatch.setattr(colmap_reconstruction, "map_in_rounds", lambda *_: MappedModels([], "incremental"))
     job = replace(job, options=job.options.model_copy(update={"features": features}))
     with refused("no-matches") as caught:
         colmap_reconstruction.map_matches(pycolmap_module(), job, SILENT)

@@ -233,7 +233,7 @@ def test_what_is_joined_is_told_with_the_size_of_each_model(
     models = [part_of(truth, ids[:9], 1), part_of(truth, ids[9:], 2)]
     monkeypatch.setattr(rounds, "map_database", lambda *_, **__: (models, "incremental"))
     monkeypatch.setattr(rounds, "missing_for_learned", lambda: "an extra")
-    assert rounds.align(pycolmap, job, SILENT).registered == IMAGES
+    assert rounds.map_in_rounds(pycolmap, job, SILENT).registered == IMAGES
     (told,) = [record for record in caplog.records if getattr(record, "code", "") == "survey-in-parts"]
     assert numbers(told.getMessage()) == [2, 9, IMAGES - 9]
 
