@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from pyproj import CRS
 from pyproj.crs import CompoundCRS
+from pyproj.exceptions import CRSError
 
 from pipelines.core.errors import InputError
 from pipelines.core.products import Remark
@@ -168,7 +169,10 @@ class _Placing:
             return False
         places = [self._place(statement) for statement in (one, other)]
         if places[0] is None or places[1] is None:
-            first, second = CRS.from_user_input(one.horizontal), CRS.from_user_input(other.horizontal)
+            try:
+                first, second = CRS.from_user_input(one.horizontal), CRS.from_user_input(other.horizontal)
+            except CRSError:  # A text that is no CRS is refused where it is used.
+                return True
             epsg = first.to_epsg()
             same = first.equals(second, ignore_axis_order=True) or (epsg is not None and epsg == second.to_epsg())
             return not same or (places[0] is None) != (places[1] is None)
