@@ -82,30 +82,10 @@ def reference_alone(model: Any, survey: Survey) -> Any:
     """Return a model without the photographs of companions, and without the points that only these show."""
     flat = flatten(model)
     others = {each.name for each in survey.companions}
-    kept = np.array([name not in others for name in flat.image_name])
-    seen = kept[flat.obs_image]
-    count = np.bincount(flat.obs_point[seen], minlength=len(flat.point_id))
-    held = count >= 2
-    seen &= held[flat.obs_point]
-    place, point = np.cumsum(kept) - 1, np.cumsum(held) - 1
-    used = set(flat.image_camera_id[kept].tolist())
+    part = flat.of_images(np.flatnonzero([name not in others for name in flat.image_name]))
+    used = set(part.image_camera_id.tolist())
     return reconstruction_of(
-        replace(
-            flat,
-            cameras={key: camera for key, camera in flat.cameras.items() if key in used},
-            image_id=flat.image_id[kept],
-            image_name=tuple(name for name, keep in zip(flat.image_name, kept, strict=True) if keep),
-            image_camera_id=flat.image_camera_id[kept],
-            rotation_cam_from_local=flat.rotation_cam_from_local[kept],
-            translation_cam_from_local=flat.translation_cam_from_local[kept],
-            point_id=flat.point_id[held],
-            point_in_local=flat.point_in_local[held],
-            point_rgb=flat.point_rgb[held],
-            point_error_px=flat.point_error_px[held],
-            obs_point=point[flat.obs_point[seen]],
-            obs_image=place[flat.obs_image[seen]],
-            obs_xy_px=flat.obs_xy_px[seen],
-        )
+        replace(part, cameras={key: lens for key, lens in part.cameras.items() if key in used})
     )
 
 
