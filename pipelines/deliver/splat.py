@@ -120,13 +120,14 @@ def splat_values(splat: PlacedSplat | SplatParts) -> dict[str, object]:
 def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
     """Return the splat of a workspace, placed on Earth; a DegenerateGeometryError: no Gaussian is opaque enough."""
     path, origin = model_to_deliver(workspace, options)
-    placement = _trained_placement(workspace)
+    model = load_json(TrainedModel, workspace.path(MODEL))
+    placement = _placement_of(workspace, model)
     splat = placed_splat(read_gaussians(path), placement, options, crop_of(workspace, options))
-    return replace(splat, model=origin, mip_filter=load_json(TrainedModel, workspace.path(MODEL)).mip_filter)
+    return replace(splat, model=origin, mip_filter=model.mip_filter)
 
 
-def _trained_placement(workspace: Workspace) -> Placement:
-    survey, model = load_survey(workspace), load_json(TrainedModel, workspace.path(MODEL))
+def _placement_of(workspace: Workspace, model: TrainedModel) -> Placement:
+    survey = load_survey(workspace)
     return place(model, survey, read_centres(workspace.path(GAUSSIANS)), headline_of(workspace))
 
 
@@ -136,7 +137,7 @@ def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatPar
     centers, crop = read_centres(path), crop_of(workspace, options)
     chosen = _chosen(centers, read_logit_opacities(path), options, crop)
     _require_any(chosen, options)
-    placement = _trained_placement(workspace)
+    placement = _placement_of(workspace, load_json(TrainedModel, workspace.path(MODEL)))
     center_in_file = placement.file_from_model.apply(centers[chosen]).astype(np.float32)
     whole = (slice(0, len(centers)),)
     rows = whole if origin == "cleaned" else _rows_of_blocks(workspace, len(centers))
