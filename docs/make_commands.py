@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +12,27 @@ import click
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from georef_cli.command import Command, shared_options  # noqa: E402
-from georef_cli.main import COMMANDS, cli  # noqa: E402
+from georef_cli.command import COMMANDS, Command, shared_options  # noqa: E402
+from georef_cli.main import cli  # noqa: E402
+from georef_cli.topics import TOPICS, topic_text  # noqa: E402
 
 INTRODUCTION = """# Commands
 
-Made by `python docs/make_commands.py` from the help of the commands; a test compares the two.
+Made by `python docs/make_commands.py` from the help of commands and [topics](#topics); a test compares them.
 
-Results go to stdout, everything else to stderr and to `logs/<stage>.log` in the workspace. Exit codes: 0 done,
-1 known failure, 2 usage (a wrong command line, an option out of range), 130 interrupted.
-
-With `--json`, stdout is one JSON document. When the command fails, the document is
-`{"error": {"code", "message", "path", "line", "field", "hint"}}`. `code` names the kind of failure: `usage`,
+Results go to stdout, everything else to stderr and to `logs/<stage>.log` in the workspace;
+[For scripts](#for-scripts) has exit codes and the form of a failure with `--json`. Its `kind` is one of `usage`,
 `input`, `missing-product`, `busy`, `geometry`, `inconsistent`, `convergence`, `resources`, `backend`, `storage`,
-`crash`, `cluster`, `interrupted`, `failed`, or `defect` for an exception that nobody foresaw. Keys without a value
-are null.
+`crash`, `cluster`, `interrupted`, `failed`, or `defect` for an exception that nobody foresaw; its `code` names the
+failure itself. Keys without a value are null.
 
 Every command takes these options, before or after its name:
 
 SHARED
+"""
+TOPICS_HEAD = """## Topics
+
+The texts of `georef help TOPIC`.
 """
 
 
@@ -40,7 +43,7 @@ def describe(name: str) -> str:
     text, _, examples = (command.help or "").partition("\b\nExamples:\n")
     arguments = " ".join(param.make_metavar(click.Context(command)) for param in _of(command, click.Argument))
     assert isinstance(command, Command)
-    rows = [_row(option) for option in command.own_params if isinstance(option, click.Option)]
+    rows = [_row(option) for option in command.own_params if isinstance(option, click.Option) and not option.hidden]
     calls = "\n".join(line.strip() for line in examples.strip().splitlines())
     return "\n".join(
         [
@@ -52,6 +55,12 @@ def describe(name: str) -> str:
             f"\n```sh\n{calls}\n```\n",
         ]
     )
+
+
+def explain(topic: str) -> str:
+    """The section of one topic of `georef help`: its text as the terminal shows it."""
+    title, _, text = topic_text(topic).strip().partition("\n")
+    return f"### {title}\n\n" + textwrap.indent(text.strip("\n"), "    ") + "\n"
 
 
 def _row(option: click.Option) -> str:
@@ -80,9 +89,8 @@ def _escape(text: str) -> str:
 def main() -> None:
     """Write the document, or print it."""
     shared = "\n".join(["| option | meaning |\n|---|---|", *(_row(option) for option in shared_options())])
-    document = (
-        "\n".join([INTRODUCTION.replace("SHARED", shared), *(describe(name) for name in COMMANDS)]).rstrip() + "\n"
-    )
+    sections = [*(describe(name) for name in COMMANDS), TOPICS_HEAD, *map(explain, TOPICS)]
+    document = "\n".join([INTRODUCTION.replace("SHARED", shared), *sections]).rstrip() + "\n"
     if "--print" in sys.argv:
         sys.stdout.write(document)
     else:

@@ -25,20 +25,20 @@ from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.splat.gaussians import read_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.photographs import Pinholes
 from pipelines.survey.scene import photographs
+from pipelines.survey.solution import Solution, read_sfm, read_trained
 from pipelines.survey.survey import Fix, SurveyImage
-from pipelines.survey.trained_survey import TrainedSurvey, load_trained
 
 
-def geo_from_cam(image: SurveyImage, trained: TrainedSurvey, recorded: bool) -> FloatArray:
+def geo_from_cam(image: SurveyImage, index: int, solution: Solution, recorded: bool) -> FloatArray:
     """Rotation (3, 3) of a photograph's camera, measured or trained."""
     if recorded:
         if image.attitude is None:
             raise SystemExit(f"{image.name} has no recorded attitude")
         return matrix_from_quat_xyzw(image.attitude.quat_xyzw)
-    index = trained.sparse.image_index()[image.name]
-    return np.asarray(trained.geo_from_model.rotation @ trained.poses.cam_from_model[index].T)
+    return np.asarray(solution.similarity.rotation @ solution.poses.cam_from_model[index].T)
 
 
 def cam_from_ply(fix: Fix, rotation_geo_from_cam: FloatArray, origin: Origin, splat: Path) -> torch.Tensor:
@@ -63,21 +63,19 @@ def main() -> None:
     parser.add_argument("--attitude", choices=("trained", "recorded"), default="trained")
     options = parser.parse_args()
     workspace = Workspace(options.workspace)
-    trained = load_trained(workspace)
-    registered = [
-        (image, image.fix)
-        for image in trained.survey.images
-        if image.name in trained.sparse.image_index() and image.fix is not None
-    ]
+    solution, survey = read_trained(workspace), load_survey(workspace)
+    sfm = read_sfm(workspace, solution)
+    number = sfm.image_index()
+    registered = [(image, image.fix) for image in survey.images if image.name in number and image.fix is not None]
     chosen = registered[:: max(1, len(registered) // options.images)][: options.images]
-    images = photographs(trained.sfm, trained.survey, workspace, options.size)
-    pinholes = Pinholes(images, trained.sfm.lenses, trained.sparse.lenses)
+    images = photographs(sfm, survey, workspace, options.size)
+    pinholes = Pinholes(images, sfm.lenses, solution.with_lenses(sfm).lenses)
     gaussians, backend = read_gaussians(options.splat), rasterizer("auto")
     options.output.mkdir(parents=True, exist_ok=True)
     for image, fix in chosen:
-        index = trained.sparse.image_index()[image.name]
-        rotation = geo_from_cam(image, trained, options.attitude == "recorded")
-        pose = cam_from_ply(fix, rotation, trained.survey.origin_on_earth, options.splat)
+        index = number[image.name]
+        rotation = geo_from_cam(image, index, solution, options.attitude == "recorded")
+        pose = cam_from_ply(fix, rotation, survey.origin_on_earth, options.splat)
         with torch.no_grad():
             render = backend.render(gaussians, pose, pinholes.of(index), RasterSettings())
         colour = render.colour.clamp(0, 1).mul(255).byte().numpy()

@@ -57,7 +57,7 @@ def exit_of(error: BaseException) -> Exit | None:
         error.show(text)
         field = param.opts[-1] if isinstance(param, click.Option) else getattr(error, "option_name", None)
         document = _document("usage" if error.exit_code == USAGE else "failed", error.format_message())
-        document |= {"field": field, "hint": None if context is None else f"{context.command_path} --help"}
+        document |= {"field": field, "remedy": None if context is None else f"{context.command_path} --help"}
         return Exit(error.exit_code, printable_lines(text.getvalue().rstrip("\n")), document)
     known = error if isinstance(error, GeorefError) else storage_error(error)
     if known is None:
@@ -68,7 +68,7 @@ def exit_of(error: BaseException) -> Exit | None:
 
 def _document(kind: str, message: str) -> ErrorDocument:
     """Return the JSON form of a failure that is no `GeorefError`: its kind is its code."""
-    return {"kind": kind, "code": kind, "message": message, "path": None, "line": None, "field": None, "hint": None}
+    return {"kind": kind, "code": kind, "message": message, **dict.fromkeys(("path", "line", "field", "remedy"))}
 
 
 LOGGERS = ("pipelines", "georef_cli")

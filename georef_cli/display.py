@@ -40,7 +40,7 @@ class ConsoleHandler(logging.Handler):
         self._console.print(Text(self.format(record), style=style))
 
 
-def is_told(verbosity: Verbosity) -> bool:
+def is_logged(verbosity: Verbosity) -> bool:
     """Return whether the reader of stdout has the lines on stderr before their eyes, on the same terminal."""
     return not verbosity.quiet and sys.stderr.isatty() and sys.stdout.isatty()
 

@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from georef_cli import tables
-from georef_cli.layout import plain_table, shown
 from georef_cli.output import print_json, print_rich, size
-from georef_cli.tables import Renderable
+from georef_cli.tables import Renderable, literal, plain_table
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import OptionsT, flag_name, notation, require_available
 from pipelines.core.plan import OptionOrigin, PlannedStage, photograph_folder, plan
@@ -29,6 +28,7 @@ from pipelines.core.staleness import Flags
 from pipelines.core.workspace import Summary, Workspace
 from pipelines.ingest.options import IngestOptions
 from pipelines.jobs import pace
+from pipelines.jobs.costs import COSTS, Work
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import Survey
 from pipelines.train.options import TrainOptions
@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _FEATURES_BYTES = 2_500_000  # of a photograph in COLMAP's database and model
-_TRAINED_PIXEL_BYTES = 8  # a smaller photograph, its depth map and confidence
+# A smaller photograph, its depth map and confidence; the model's depth and colour, and the surface fused from them.
+_TRAINED_PIXEL_BYTES = 17
 _GAUSSIAN_BYTES = 59 * 4 * 5  # parameters and both moments in the checkpoint, the model, and the PLY
 
 
@@ -60,7 +61,7 @@ class RunEstimate:
     planned: Sequence[PlannedStage]
     photographs: FoundPhotographs | None  # None: in a bag that was not read yet
     seconds: Mapping[str, float | None]  # about, by stage that would run; None: not measured, as on a GPU
-    modelled: Mapping[str, float]  # the same, before this machine's own runs correct it
+    modelled: Mapping[str, float | None]  # the same, before this machine's own runs correct it
     reconstruction: ReconstructionEstimate | None  # None where none would run, or before a bag is read
     training: TrainingEstimate | None  # likewise
     compilation_s: float = 0.0  # by which the training is later on a machine that has to compile its kernels
@@ -112,8 +113,7 @@ def estimate_run(
             reconstruction = reconstructor_of(sfm).estimate(photographs.count, photo_px, sfm)
         if (train := _to_run(planned, TrainOptions)) is not None:
             training = estimate_training(photographs.count, photo_px, train)
-    seconds: dict[str, float | None] = {}
-    modelled: dict[str, float] = {}
+    modelled: dict[str, float | None] = {}
     for name, estimate in (("sfm", reconstruction), ("train", training)):
         if estimate is not None and estimate.refusal:
             planned = [
@@ -121,16 +121,14 @@ def estimate_run(
                 for row in planned
             ]
         elif estimate is not None:
-            seconds[name] = estimate.seconds
-            modelled |= {} if estimate.seconds is None else {name: estimate.seconds}
+            modelled[name] = estimate.seconds
     if photographs is not None:
         width, height = photographs.size_px if training is None else training.training_px
-        megapixels = photographs.count * width * height / 1e6
+        work = Work(photographs=photographs.count, megapixels=photographs.count * width * height / 1e6)
         for row in planned:
-            rough = pace.modelled_s(row.stage, photographs.count, megapixels)
-            if row.works and rough is not None:
-                modelled[row.stage] = rough
-    seconds |= {name: pace.corrected(name, value) for name, value in modelled.items()}
+            if row.works and row.stage in COSTS:
+                modelled[row.stage] = COSTS[row.stage].of(work)
+    seconds = {name: None if value is None else pace.corrected(name, value) for name, value in modelled.items()}
     once_s = 0.0 if training is None or training.refusal else compilation_s()
     return RunEstimate(planned, photographs, seconds, modelled, reconstruction, training, once_s)
 
@@ -139,12 +137,12 @@ def checked_inputs(
     workspace: Workspace, planned: Sequence[PlannedStage], progress: Progress = SILENT
 ) -> Summary | None:
     """Return the summary of the survey that `ingest` would make, unwritten; None where it would not run."""
-    asked = _to_run(planned, IngestOptions)
-    if asked is None:
+    ingest_options = _to_run(planned, IngestOptions)
+    if ingest_options is None:
         return None
     from pipelines.ingest.stage import check_inputs
 
-    return check_inputs(workspace, asked, progress)
+    return check_inputs(workspace, ingest_options, progress)
 
 
 def _to_run(planned: Sequence[PlannedStage], options: type[OptionsT]) -> OptionsT | None:
@@ -200,27 +198,27 @@ def print_dry_run(
     run = replace(run, planned=[_with_origins(row, given) for row in run.planned])
     survey = checked_inputs(workspace, run.planned, progress)
     for warning in () if survey is None else survey.warnings:
-        log.warning("ingest: %s", warning.sentence, extra={"code": warning.code})
+        log.warning("ingest: %s", warning.text, extra={"code": warning.code})
     if as_json:
         print_json(_document(workspace, run, survey))
         return
     table = plain_table("stage", "", "about", "why", right=[2])
     for row in run.planned:
         action = f"[{_STYLE[row.action]}]{row.action}[/]"
-        table.add_row(row.stage, action, about(run.seconds.get(row.stage)), shown(row.reason))
+        table.add_row(row.stage, action, about(run.seconds.get(row.stage)), literal(row.reason))
     parts: list[Renderable] = [table, *tables.origins([origin for row in run.planned for origin in row.options])]
     if run.photographs is not None:
         width, height = run.photographs.size_px
         files = "" if run.photographs.bytes is None else f", {size(run.photographs.bytes)}"
         parts.append(f"\n[bold]Photographs[/]: {run.photographs.count} of {width}×{height} px{files}")
     if survey is not None:
-        parts.append(f"\n[bold]Survey[/]: {shown(survey.key_figure)}")
-        parts += [f"  assumed: {shown(assumption.sentence)}" for assumption in survey.assumptions]
+        parts.append(f"\n[bold]Survey[/]: {literal(survey.key_figure)}")
+        parts += [f"  assumed: {literal(assumption.text)}" for assumption in survey.assumptions]
         parts += tables.cautions({"ingest": survey.cautions})
     if run.reconstruction is not None:
-        parts += ["\n[bold]Reconstruction[/]", *(f"  {shown(text)}" for text in run.reconstruction.sentences())]
+        parts += ["\n[bold]Reconstruction[/]", *(f"  {literal(text)}" for text in run.reconstruction.sentences())]
     if run.training is not None:
-        parts += ["\n[bold]Training[/]", *(f"  {shown(text)}" for text in run.training.sentences())]
+        parts += ["\n[bold]Training[/]", *(f"  {literal(text)}" for text in run.training.sentences())]
     if run.compilation_s:
         parts.append(f"  about {about(run.compilation_s)} more, once: this machine compiles the kernels")
     if run.photographs is not None:

@@ -1,6 +1,4 @@
-"""Group `georef`: a table of commands, each imported when it is called.
-
-A module of `georef_cli.commands` holds a `command`, or a function of that name that returns one of several by name.
+"""Group `georef`: the commands of the table, each imported when it is called.
 
 `georef --help` reads the table alone, to answer at once. It imports no command module, and therefore neither the
 validation library nor any heavier one.
@@ -11,16 +9,15 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
 
 import click
 
 from georef_cli import boundary
-from georef_cli.command import Command, merged_verbosity, shared_options
+from georef_cli.command import COMMANDS, TOGETHER, Command, command_module, merged_verbosity, shared_options
 from georef_cli.native_lines import native_lines_logged
-from pipelines.core.stages import CHANGE, CLEAN, DELIVERABLES, PIPELINE, SPLAT, StageSpec
+from pipelines.core.stages import BY_NAME
 from pipelines.core.version import described_version
 
 PROGRAM = "georef"
@@ -29,60 +26,6 @@ PROGRAM = "georef"
 # program uses a core: on two cores, training was six times slower. OpenMP reads the variable when it is loaded, and
 # no import above loads it.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
-
-@dataclass(frozen=True)
-class HelpLine:
-    """Line of `georef --help` below the heading of its section."""
-
-    section: str
-    help: str
-    module: str = ""  # of several commands, in `georef_cli.commands`; empty: a module of its own
-
-
-# Stages whose commands do more than run them, in modules of their own.
-_OF_THEIR_OWN = frozenset({"sfm", "calibrate", "evaluate", "export-ply"})
-
-
-def _of_stages(*stages: StageSpec) -> dict[str, HelpLine]:
-    return {
-        spec.name: HelpLine(
-            "Stages" if spec in PIPELINE and spec.product != SPLAT else "Deliverables",
-            spec.title,
-            "" if spec.name in _OF_THEIR_OWN else "stages",
-        )
-        for spec in stages
-        if not spec.called
-    }
-
-
-COMMANDS: dict[str, HelpLine] = {
-    "simulate": HelpLine("Start", "Simulate a survey whose truth is known exactly."),
-    "inspect": HelpLine("Start", "Show what a ROS bag holds, and what ingest would choose."),
-    "run": HelpLine("Pipeline", "Run all stages, or some, skipping what is current."),
-    "batch": HelpLine("Pipeline", "Run many missions, and put their results into one table."),
-    "blocks": HelpLine("Pipeline", "Train a large survey in blocks, and merge them."),
-    "compare": HelpLine("Pipeline", "Run the ablation and put its figures into one table."),
-    "cluster certificates": HelpLine(
-        "Pipeline", "Make the certificate that the machines of a cluster share.", "cluster"
-    ),
-    "cluster scheduler": HelpLine("Pipeline", "Start the scheduler of a cluster.", "cluster"),
-    "cluster worker": HelpLine("Pipeline", "Lend this machine to a cluster.", "cluster"),
-    "status": HelpLine("Pipeline", "Show the state of every stage."),
-    "info": HelpLine("Pipeline", "Show where on Earth the result is, and what each file is for."),
-    "view": HelpLine("Pipeline", "See the trained model in a browser, and measure in it."),
-    "marks": HelpLine("Pipeline", "Propose marks of ground points in the photographs that lack them."),
-    **_of_stages(*PIPELINE, CLEAN, *DELIVERABLES, CHANGE),
-    "help": HelpLine("Start", "Explain a topic, such as heights or options, or a command."),
-    "doctor": HelpLine("Start", "Show what this machine offers: memory, GPU, backends, geoid grids."),
-}
-# Commands of two words are one line of the help, so that it fits on a screen.
-TOGETHER = {"cluster": "Lend machines to a cluster: certificates, scheduler, worker."}
-
-
-def command_module(name: str) -> str:
-    """Return the module in `georef_cli.commands` that defines a command of the table."""
-    return COMMANDS[name].module or name.replace("-", "_")
 
 
 class LazyGroup(click.Group):
@@ -94,10 +37,12 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        found = importlib.import_module(f"georef_cli.commands.{command_module(cmd_name)}").command
-        command = found if isinstance(found, Command) else found(cmd_name)
-        assert isinstance(command, Command)
-        return command
+        module = importlib.import_module(f"georef_cli.commands.{command_module(cmd_name)}")
+        if cmd_name in BY_NAME:
+            made: Command = module.stage_command(cmd_name)
+            return made
+        held = (each for each in vars(module).values() if isinstance(each, Command))
+        return next(each for each in held if each.name == cmd_name)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -147,9 +92,8 @@ def _tell_version(ctx: click.Context, _option: click.Parameter, is_asked: bool) 
     "--version", is_flag=True, expose_value=False, is_eager=True, callback=_tell_version, help="Show the version."
 )
 def cli() -> None:
-    """From drone flights to georeferenced 3D Gaussian splats.
-
-    Every command works on a workspace, the folder of a survey's products.
+    """From drone flights to georeferenced 3D Gaussian splats. Every command works on a workspace,
+    the folder of a survey's products.
 
     \b
     Examples:

@@ -3,6 +3,7 @@
 A stage's options are derived from its class of options (names, types, meaning, defaults): each is defined once.
 """
 
+import inspect
 import logging
 import types
 from collections.abc import Iterable
@@ -13,6 +14,7 @@ import click
 from pydantic.fields import FieldInfo
 
 from pipelines.core.options import (
+    HIDDEN,
     WRITTEN,
     OptionsT,
     StageOptions,
@@ -60,6 +62,12 @@ SET = click.Option(
 )
 
 
+def help_of(options_type: type[StageOptions]) -> str:
+    """Return what `--help` says of a stage: the docstring of its options without their own title."""
+    text = inspect.cleandoc(options_type.__doc__ or "").partition("\n\n")[2]
+    return text.replace("\nExamples:\n", "\n\b\nExamples:\n")
+
+
 def forgotten(options_type: type[StageOptions], names: Iterable[str]) -> list[str]:
     """Return the fields that the user names with `--forget`; `all` stands for each of them."""
     if "all" in (named := list(names)):
@@ -80,21 +88,30 @@ def stage_option(options_type: type[StageOptions], name: str) -> click.Option:
     """Return the click option of a field; it has no default of its own: its help states the field's."""
     info, flag = options_type.model_fields[name], flag_name(options_type, name)
     help_text = " ".join(filter(None, [info.description, _default_and_range(info)]))
+    hidden = HIDDEN in marks_of(info)
     if WRITTEN in marks_of(info):
-        return click.Option([flag, name], type=click.STRING, default=None, help=help_text)
+        return click.Option([flag, name], type=click.STRING, default=None, help=help_text, hidden=hidden)
     kind: Any = info.annotation
     if get_origin(kind) in (Union, types.UnionType):
         (kind,) = [member for member in get_args(kind) if member is not type(None)]
     kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     if kind is bool:
         return click.Option(
-            [f"{flag}/--no-{flag.removeprefix('--')}", name], is_flag=True, default=None, help=help_text
+            [f"{flag}/--no-{flag.removeprefix('--')}", name],
+            is_flag=True,
+            default=None,
+            help=help_text,
+            hidden=hidden,
         )
     if get_origin(kind) is tuple:
         return click.Option(
-            [flag, name], multiple=True, type=_click_type(get_args(kind)[0]), help=help_text + "  [repeatable]"
+            [flag, name],
+            multiple=True,
+            type=_click_type(get_args(kind)[0]),
+            help=help_text + "  [repeatable]",
+            hidden=hidden,
         )
-    return click.Option([flag, name], type=_click_type(kind), default=None, help=help_text)
+    return click.Option([flag, name], type=_click_type(kind), default=None, help=help_text, hidden=hidden)
 
 
 def resolved(ctx: click.Context, options_type: type[OptionsT], toml: Path) -> OptionsT:
@@ -151,7 +168,7 @@ def settings(
     """
     running = [spec.name for spec in stages]
     by_name = {spec.name: spec for spec in (*stages, *later)}
-    found: dict[str, dict[str, Any]] = {}
+    by_stage: dict[str, dict[str, Any]] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         stage, _, name = key.partition(".")
@@ -171,8 +188,8 @@ def settings(
             continue
         parsed = _value(value)
         is_path = name in input_markers(options) and isinstance(parsed, str)
-        found.setdefault(stage, {})[name] = Path(parsed).absolute() if is_path else parsed
-    return found
+        by_stage.setdefault(stage, {})[name] = Path(parsed).absolute() if is_path else parsed
+    return by_stage
 
 
 def _value(text: str) -> Any:

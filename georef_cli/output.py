@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -12,11 +13,11 @@ from rich.table import Table
 from rich.text import Text
 
 from georef_cli import tables
-from georef_cli.evaluation import with_evaluation
-from georef_cli.layout import ByWidth, Safe, plain_table, shown
-from georef_cli.tables import Renderable
-from pipelines.core.products import Remark, dump_json
+from georef_cli.tables import ByWidth, Renderable, Safe, literal, plain_table
+from pipelines.core.errors import GeorefError
+from pipelines.core.products import Remark, dump_json, union
 from pipelines.core.runner import Outcome
+from pipelines.core.stages import ADJUSTMENT, MODEL, REPORT
 from pipelines.core.staleness import cautions_by_stage, document_of_cautions
 from pipelines.core.workspace import Workspace
 from pipelines.survey.headline import headline_of
@@ -24,6 +25,8 @@ from pipelines.survey.headline import headline_of
 if TYPE_CHECKING:
     from pipelines.deliver.overview import Overview
     from pipelines.survey.report import EvaluationReport
+
+log = logging.getLogger(__name__)
 
 _UNITS = ("B", "kB", "MB", "GB", "TB")
 
@@ -33,7 +36,7 @@ def overview_text(result: Overview) -> list[Renderable]:
     wide = plain_table("\nfile", "\nsize", "\nmade", "\nstate", "\nuse", right=[1])
     narrow = plain_table("\nfile", "\nsize", "\nstate", "\nuse", right=[1])
     for file in result.files:
-        name, count, use = shown(file.path), size(file.bytes), shown(file.description)
+        name, count, use = literal(file.path), size(file.bytes), literal(file.description)
         state = f"[{tables.STATE_STYLE.get(file.state, 'dim')}]{file.state}[/]"
         wide.add_row(name, count, tables.when(file.made), state, use)
         narrow.add_row(name, count, state, use)
@@ -41,7 +44,7 @@ def overview_text(result: Overview) -> list[Renderable]:
     if result.further:
         parts.append("\n[bold]Not made yet[/]")
         parts += [
-            f"  {shown(spec.command(result.workspace))}  [dim]{shown(spec.title)}[/]" for spec in result.further
+            f"  {literal(spec.command(result.workspace))}  [dim]{literal(spec.title)}[/]" for spec in result.further
         ]
     return [*parts, *tables.cautions(result.cautions)]
 
@@ -54,7 +57,7 @@ def run_summary(result: Overview) -> list[Renderable]:
     for file in result.files:
         style = tables.STATE_STYLE.get(file.state, "dim")
         state = "" if file.state == "current" else f"[{style}]{file.state}[/] "
-        files.add_row(f"  {shown(file.path)}", f"{state}[dim]{shown(file.description)}[/]")
+        files.add_row(f"  {literal(file.path)}", f"{state}[dim]{literal(file.description)}[/]")
     names = ",".join(spec.name.removeprefix("export-") for spec in result.further)
     further = {
         f"georef view {workspace}": "see it in a browser, and measure in it",
@@ -62,9 +65,9 @@ def run_summary(result: Overview) -> list[Renderable]:
         f"georef evaluate {workspace}": "all figures of test views, check points and fit",
         **({f"georef run {workspace} --deliver {names}": "further deliverables"} if names else {}),
     }
-    steps = [f"  {shown(command)}  [dim]{use}[/]" for command, use in further.items()]
+    steps = [f"  {literal(command)}  [dim]{use}[/]" for command, use in further.items()]
     parts: list[Renderable] = ["", *_headline(result), _place(result, brief=True)]
-    return [*parts, f"\n[bold]Files[/] in {shown(str(workspace))}", files, "\n[bold]Next[/]", *steps]
+    return [*parts, f"\n[bold]Files[/] in {literal(str(workspace))}", files, "\n[bold]Next[/]", *steps]
 
 
 def size(count: int) -> str:
@@ -75,19 +78,19 @@ def size(count: int) -> str:
 
 def _headline(result: Overview) -> list[str]:
     """Return whether the result is that of the present inputs and options, its size and place, interrupted runs."""
-    place = f"in a {result.bounds.crs}"
+    location = f"in a {result.bounds.crs}"
     if result.center_lla is not None:
         lat, lon, _ = result.center_lla
-        place = f"at {abs(lat):.6f}° {'S' if lat < 0 else 'N'}, {abs(lon):.6f}° {'W' if lon < 0 else 'E'}"
+        location = f"at {abs(lat):.6f}° {'S' if lat < 0 else 'N'}, {abs(lon):.6f}° {'W' if lon < 0 else 'E'}"
     state = ""
     if result.outdated:
         first, *others = result.outdated
         more = f"; and {', '.join(row.stage for row in others)}" if others else ""
-        why = shown(f"{first.stage}: {first.reason}{more}")
+        why = literal(f"{first.stage}: {first.reason}{more}")
         state = f" is [{tables.STATE_STYLE[first.state]}]{first.state}[/] ({why})"
     return [
-        f"[bold]{shown(str(result.workspace))}[/]{state}: {result.gaussians} Gaussians {place}",
-        *(f"[yellow]{stage}[/]: {shown(found)}" for stage, found in result.interrupted.items()),
+        f"[bold]{literal(str(result.workspace))}[/]{state}: {result.gaussians} Gaussians {location}",
+        *(f"[yellow]{stage}[/]: {literal(progress)}" for stage, progress in result.interrupted.items()),
     ]
 
 
@@ -120,7 +123,7 @@ def _place(result: Overview, *, brief: bool = False) -> Table:
         lines["test views"] = f"PSNR {result.psnr:.2f} dB"
     table = plain_table("", "", header=False)
     for name, text in lines.items():
-        table.add_row(shown(name), shown(text))
+        table.add_row(literal(name), literal(text))
     return table
 
 
@@ -128,6 +131,7 @@ PIPED_WIDTH = 120
 
 
 def print_json(document: Any) -> None:
+    """Write a document to stdout as JSON."""
     click.echo(dump_json(document))
 
 
@@ -149,6 +153,7 @@ def print_rich(*parts: RenderableType) -> None:
 
 
 def document_of(outcome: Outcome) -> dict[str, Any]:
+    """Return the JSON form of what a stage came to."""
     manifest = outcome.manifest
     return {
         "stage": outcome.stage,
@@ -160,17 +165,19 @@ def document_of(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def print_outcome(workspace: Workspace, outcome: Outcome, *more: RenderableType, as_json: bool, told: bool) -> None:
+def print_outcome(
+    workspace: Workspace, outcome: Outcome, *more: RenderableType, as_json: bool, logged: bool
+) -> None:
     """Print the result of a stage, what more there is to show of it, and the cautions that the stage adds.
 
-    The JSON document has those of the whole workspace. `told`: the log on the same terminal has shown the headline.
+    The JSON document has those of the whole workspace. `logged`: the log on the same terminal has the headline.
     """
     cautions = cautions_by_stage(workspace)
     if as_json:
         print_json({**document_of(outcome), "cautions": document_of_cautions(cautions)})
     else:
         added = {outcome.stage: cautions.get(outcome.stage, ())}
-        print_rich(*tables.outcome(workspace, outcome, headline=not told), *more, *tables.cautions(added))
+        print_rich(*tables.outcome(workspace, outcome, headline=not logged), *more, *tables.cautions(added))
 
 
 def print_outcomes(
@@ -181,12 +188,12 @@ def print_outcomes(
     *,
     cautions: Mapping[str, tuple[Remark, ...]] | None = None,
     as_json: bool,
-    told: bool,
+    logged: bool,
 ) -> None:
     """Print the results of several stages, the overview of the whole if there is one, and last the cautions.
 
     `solved` is the evaluation of cameras without training. `cautions` of stages stand beside those of the products.
-    `told`: the log on the same terminal has shown the rest.
+    `logged`: the log on the same terminal has shown the rest.
     """
     cautions = with_evaluation({**cautions_by_stage(workspace), **(cautions or {})}, solved)
     if as_json:
@@ -196,7 +203,7 @@ def print_outcomes(
             document["evaluation"] = solved.model_dump(mode="json")
         print_json({**document, "cautions": document_of_cautions(cautions)})
         return
-    if not told:
+    if not logged:
         print_rich(tables.outcomes(outcomes))
     if result is not None:
         print_rich(*run_summary(result))
@@ -204,6 +211,44 @@ def print_outcomes(
         if solved is not None:
             print_rich(*tables.report(solved), *tables.error_tables(solved))
         print_rich(*tables.accuracy_line(headline_of(workspace) if solved is None else solved.headline))
-        if told:
-            print_rich(f"[bold]Next[/]: georef run {shown(str(workspace.root))} completes it")
+        if logged:
+            print_rich(f"[bold]Next[/]: georef run {literal(str(workspace.root))} completes it")
     print_rich(*tables.cautions(cautions))
+
+
+def evaluated_cameras(workspace: Workspace, *, with_area: bool = True) -> EvaluationReport | None:
+    """Return the evaluation of the cameras alone; without its area, which takes longest, where nobody shows it.
+
+    Nothing is written. The cameras measure the check points as they will after training, to within the changes of
+    the adjustment there.
+
+    None: a model is trained, there is a report of `georef evaluate`, or the cameras cannot be evaluated.
+    """
+    if workspace.has(MODEL) or workspace.has(REPORT) or not workspace.has(ADJUSTMENT):
+        return None
+    from pipelines.adjust.solution import posterior_of
+    from pipelines.evaluate.options import EvaluateOptions
+    from pipelines.evaluate.stage import area_of_interest, evaluate
+    from pipelines.survey.calibrated import load_survey
+    from pipelines.survey.solution import read_sfm, read_solution
+
+    try:
+        solution = read_solution(workspace)
+        sfm, survey = read_sfm(workspace, solution), solution.weighted(load_survey(workspace))
+        posterior, options = posterior_of(workspace, solution, sfm), EvaluateOptions()
+        area = area_of_interest(options, workspace, solution, sfm, survey) if with_area else None
+        return evaluate(survey, posterior, options, area=area)
+    except GeorefError as error:  # The stages have succeeded all the same.
+        log.debug("no evaluation of the cameras: %s", error)
+        return None
+
+
+def with_evaluation(
+    cautions: Mapping[str, tuple[Remark, ...]], solved: EvaluationReport | None
+) -> dict[str, tuple[Remark, ...]]:
+    """Return the cautions by stage, with those that the evaluation of the cameras adds."""
+    if solved is None:
+        return dict(cautions)
+    carried = union(*cautions.values())
+    added = tuple(caution for caution in solved.cautions if caution not in carried)
+    return {**cautions, **({"evaluation": added} if added else {})}

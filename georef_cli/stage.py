@@ -4,7 +4,6 @@ Copies of products outside the workspace are complete or absent, and never over 
 """
 
 import contextlib
-import inspect
 import os
 import shutil
 import tempfile
@@ -12,14 +11,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 from rich.console import RenderableType
 
 from georef_cli import boundary, options
 from georef_cli.command import Command, merged_verbosity
-from georef_cli.display import is_told, progress_for
+from georef_cli.display import is_logged, progress_for
 from georef_cli.estimate import announced_estimate, print_dry_run
 from georef_cli.output import print_outcome
 from pipelines.core import runner
@@ -28,7 +27,7 @@ from pipelines.core.files import remove, replace_file, replace_folder
 from pipelines.core.manifest import MANIFEST
 from pipelines.core.options import remembered
 from pipelines.core.stages import BY_NAME, StageSpec
-from pipelines.core.staleness import must_exist
+from pipelines.core.staleness import Flags, must_exist
 from pipelines.core.validators import require_text
 from pipelines.core.workspace import Workspace
 
@@ -36,35 +35,36 @@ from pipelines.core.workspace import Workspace
 class StageCommand(Command):
     """Command `georef STAGE WS …`: the options of the stage, `--force` and `--json`.
 
+    Its help is the docstring of the stage's options below the title of the stage.
+
     Args:
-        doc: what `--help` says below the title of the stage.
         extra: further options.
         before: argument before the workspace, which is an option of the stage.
-        delivers: what `--to` copies: the stage's whole folder, or one file with its sidecars; None: nothing.
+        announced: whether the log begins with the estimate of the work.
         more: returns what is printed below the figures, from the workspace and the values of the options.
     """
 
     def __init__(
         self,
         name: str,
-        doc: str,
         extra: Sequence[click.Option] = (),
         *,
         before: click.Argument | None = None,
-        delivers: Literal["file", "folder"] | None = None,
+        announced: bool = False,
         more: Callable[[Workspace, Mapping[str, Any]], Sequence[RenderableType]] = lambda *_: (),
     ) -> None:
-        self.spec, self._delivers, self._more = BY_NAME[name], delivers, more
-        what = "the folder" if delivers == "folder" else "the file and its sidecar"
+        self.spec, self._more, self._announced = BY_NAME[name], more, announced
+        is_folder = self.spec.delivers == "folder"
         target = click.Option(
             ["--to", "-o", "target"],
             type=options.FILE,
-            metavar="FOLDER" if delivers == "folder" else "FILE",
-            help=f"Copy {what} here as well; what exists is replaced only with --force. A workspace that cannot be "
-            "written stays as it is.",
+            metavar="FOLDER" if is_folder else "FILE",
+            help=f"Copy {'the folder' if is_folder else 'the file and its sidecar'} here as well; what exists is "
+            "replaced only with --force. A workspace that cannot be written stays as it is.",
         )
         super().__init__(
             name,
+            title=self.spec.title,
             params=[
                 *([] if before is None else [before]),
                 options.WORKSPACE,
@@ -74,15 +74,19 @@ class StageCommand(Command):
                     if before is None or one.name != before.name
                 ),
                 *extra,
-                *([] if delivers is None else [target]),
+                *([target] if self.spec.delivers else []),
                 options.FORGET,
                 options.DRY_RUN,
                 options.flag("--force", text="Run even if the product is current."),
                 options.JSON,
             ],
-            help=f"{self.spec.title}\n\n{inspect.cleandoc(doc)}",
+            help=options.help_of(self.spec.options),
             callback=click.pass_context(self.act),
         )
+
+    def renews(self, workspace: Workspace, flags: Flags) -> bool:
+        """Return whether a product that is current is made again from its parts; here never."""
+        return False
 
     def invoke(self, ctx: click.Context) -> Any:
         if not ctx.params.pop("dry_run"):
@@ -117,32 +121,34 @@ class StageCommand(Command):
             GeorefError: the stage failed.
         """
         workspace, force, target = values["workspace"], values["force"], values.get("target")
+        delivers, is_folder = self.spec.delivers, self.spec.delivers == "folder"
         if self.spec.reads:
             must_exist(workspace)
         if target is not None:
-            check_target(target, self.spec, folder=self._delivers == "folder", overwrite=force)
+            check_target(target, self.spec, folder=is_folder, overwrite=force)
         flags = self._flags(ctx, values)
-        if self.spec.name == "train":
+        if self._announced:
             announced_estimate(workspace, (self.spec,), flags, force=force)
-        with nullcontext(workspace) if self._delivers is None else _writable(workspace, target) as place:
-            with boundary.logged_to_file(place, self.spec):
+        with _writable(workspace, target) if delivers else nullcontext(workspace) as writable:
+            with boundary.logged_to_file(writable, self.spec):
                 outcome = runner.run_stage(
-                    place,
+                    writable,
                     self.spec,
                     flags[self.spec.name],
                     force=force,
+                    renew=self.renews(workspace, flags[self.spec.name]),
                     resume="always" if values.get("resume") else "if-same",
                     progress=progress_for(ctx.obj),
                 )
             if target is not None:
-                with place.lock(self.spec.name):
-                    made = place.written if outcome.ran else place.root
-                    if self._delivers == "folder":
+                with writable.lock(self.spec.name):
+                    made = writable.written if outcome.ran else writable.root
+                    if is_folder:
                         deliver_folder(made / self.spec.folder, target)
                     else:
                         deliver(made / self.spec.product, target)
         more = self._more(workspace, values)
-        print_outcome(workspace, outcome, *more, as_json=values["as_json"], told=is_told(ctx.obj))
+        print_outcome(workspace, outcome, *more, as_json=values["as_json"], logged=is_logged(ctx.obj))
 
 
 @contextmanager
@@ -156,8 +162,9 @@ def _writable(workspace: Workspace, target: Path | None) -> Iterator[Workspace]:
         yield workspace
         return
     if target is None:
-        message = "cannot be written. Give --to: the result is made there, and the workspace stays as it is."
-        raise InputError("workspace-read-only", message, path=workspace.root)
+        message = "cannot be written."
+        remedy = "Give --to: the result is made there, and the workspace stays as it is."
+        raise InputError("workspace-read-only", message, path=workspace.root, remedy=remedy)
     with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
         yield replace(workspace, outside=Path(folder))
 
@@ -170,25 +177,29 @@ def check_target(target: Path, spec: StageSpec, *, folder: bool, overwrite: bool
     """
     suffix = Path(spec.product).suffix
     if folder and target.is_dir() and not (target / Path(spec.product).name).exists():
-        message = f"is a folder that {spec.name} did not write, and would be replaced. Give a new name."
-        raise InputError("target-not-replaced", message, path=target)
+        message = f"is a folder that {spec.name} did not write, and would be replaced."
+        remedy = "Give a new name."
+        raise InputError("target-not-replaced", message, path=target, remedy=remedy)
     if folder and target.suffix and not target.is_dir():
-        message = f"is the name of a {target.suffix} file, but {spec.name} writes a folder. Give a folder."
-        raise InputError("target-suffix", message, path=target)
+        message = f"is the name of a {target.suffix} file, but {spec.name} writes a folder."
+        remedy = "Give a folder."
+        raise InputError("target-suffix", message, path=target, remedy=remedy)
     if not folder and target.suffix.lower() != suffix:
         message = f"is not the name of a {suffix} file, which {spec.name} writes. End the name with {suffix}."
         raise InputError("target-suffix", message, path=target)
     require_text(target)
     if target.exists() and not overwrite:
-        raise InputError("target-exists", "exists already. --force replaces it.", path=target)
+        raise InputError("target-exists", "exists already.", path=target, remedy="--force replaces it.")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        message = f"cannot be made: {error.strerror}. Give --to a path in another folder."
-        raise InputError("target-folder", message, path=target.parent) from error
+        message = f"cannot be made: {error.strerror}."
+        remedy = "Give --to a path in another folder."
+        raise InputError("target-folder", message, path=target.parent, remedy=remedy) from error
     if not os.access(target.parent, os.W_OK):
-        message = "cannot be written. Give --to a path in another folder."
-        raise InputError("target-folder", message, path=target.parent)
+        message = "cannot be written."
+        remedy = "Give --to a path in another folder."
+        raise InputError("target-folder", message, path=target.parent, remedy=remedy)
 
 
 def deliver(source: Path, target: Path) -> None:

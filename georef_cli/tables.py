@@ -1,27 +1,100 @@
-"""Tables for people: typed products in, rich renderables out."""
+"""Tables for people: typed products in, rich renderables out.
+
+They fit the width of the terminal. Text of others is shown literally and without escape sequences.
+"""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
-from rich.console import Group
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.markup import escape
+from rich.measure import Measurement
+from rich.segment import Segment
 from rich.table import Table
 
-from georef_cli.layout import ByWidth, FirstThatFits, figures, plain_table, shown
 from pipelines.compare.table import POINT_FIGURES, REFERENCE_HEADS, Comparison, cells, reference_cells, remarks_on
-from pipelines.core.figures import ERRORS, MISSING, Headline
+from pipelines.core.figures import DEPTH_ERRORS, ERRORS, MISSING, Headline
 from pipelines.core.options import notation
 from pipelines.core.plan import OptionOrigin
 from pipelines.core.products import Remark
 from pipelines.core.runner import Outcome
-from pipelines.core.sentences import duration
+from pipelines.core.sentences import duration, printable, printable_lines
 from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Workspace
 from pipelines.survey.headline import PointLine, point_lines
 from pipelines.survey.report import CheckPointErrors, EvaluationReport, read_report
-from pipelines.survey.report_parts import ReferenceComparison
+from pipelines.survey.report_parts import HeldOutDepths, ReferenceComparison
+
+
+class FirstThatFits:
+    """Renderable that takes the first form that needs no more than the width of the terminal, or else the last."""
+
+    def __init__(self, *forms: RenderableType) -> None:
+        self._forms = forms
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        unlimited = options.update(max_width=10_000)
+        for form in self._forms[:-1]:
+            if Measurement.get(console, unlimited, form).maximum <= options.max_width:
+                yield form
+                return
+        yield self._forms[-1]
+
+
+class ByWidth:
+    """Renderable with one form for terminals of at least so many columns, and one with fewer columns for others."""
+
+    def __init__(self, least: int, wide: RenderableType, narrow: RenderableType) -> None:
+        self._least, self._wide, self._narrow = least, wide, narrow
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield self._wide if options.max_width >= self._least else self._narrow
+
+
+def plain_table(
+    *columns: str, header: bool = True, right: Sequence[int] = (), no_wrap: Sequence[int] = ()
+) -> Table:
+    """Return an empty table without lines; some columns are right-aligned, some are never wrapped."""
+    table = Table(*columns, show_header=header, box=None, pad_edge=False)
+    for index in right:
+        table.columns[index].justify = "right"
+    for index in no_wrap:
+        table.columns[index].no_wrap = True
+    return table
+
+
+def figures(heads: Sequence[str], rows: Mapping[str, Sequence[str]]) -> FirstThatFits:
+    """Return rows of figures: a line for each row, or a line for each figure where that is too wide.
+
+    A line break in a head separates group and name. The texts of the figures are markup.
+    """
+    wide = plain_table("", *heads, right=range(1, len(heads) + 1), no_wrap=range(len(heads) + 1))
+    for name, texts in rows.items():
+        wide.add_row(name, *texts)
+    tall = plain_table("", *rows, right=range(1, len(rows) + 1))
+    for index, head in enumerate(heads):
+        tall.add_row(head.replace("\n", " ").strip(), *(texts[index] for texts in rows.values()))
+    return FirstThatFits(wide, tall)
+
+
+def literal(text: str) -> str:
+    """Return the rich markup that shows a text of others literally, on one line."""
+    return escape(printable(text))
+
+
+class Safe:
+    """Renderable whose text, wherever it comes from, reaches the terminal without escapes of its own."""
+
+    def __init__(self, renderable: RenderableType) -> None:
+        self._renderable = renderable
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for segment in console.render(self._renderable, options):
+            yield segment if segment.control else Segment(printable_lines(segment.text), segment.style)
+
 
 STATE_STYLE = {
     "current": "green",
@@ -85,7 +158,7 @@ def states(rows: Iterable[StageState], cautions: Mapping[str, Sequence[Remark]])
     heads = ("stage", "state", "finished", "took", *(["cautions"] if cautions else []), "result")
     wide = plain_table(*heads, right=range(3, len(heads) - 1))
     for row in rows:
-        remarks = " · ".join(shown(text) for text in (row.key_figure, row.reason, row.interrupted) if text)
+        remarks = " · ".join(literal(text) for text in (row.key_figure, row.reason, row.interrupted) if text)
         state, took = f"[{STATE_STYLE[row.state]}]{row.state}[/]", duration(row.duration_s)
         count = [str(len(cautions.get(row.stage, ())) or "")] if cautions else []
         wide.add_row(row.stage, state, when(row.finished), took, *count, remarks)
@@ -101,7 +174,7 @@ def origins(rows: Sequence[OptionOrigin]) -> list[Renderable]:
     table.columns[2].overflow = "fold"
     before = ""
     for row in rows:
-        table.add_row(row.stage if row.stage != before else "", row.flag, shown(notation(row.value)), row.origin)
+        table.add_row(row.stage if row.stage != before else "", row.flag, literal(notation(row.value)), row.origin)
         before = row.stage
     return [
         "\n[bold]Changed options[/]",
@@ -112,12 +185,13 @@ def origins(rows: Sequence[OptionOrigin]) -> list[Renderable]:
 
 def accuracy_line(headline: Headline | None) -> list[Renderable]:
     """Return the line with the accuracy of the result; none before anything states it."""
-    return [] if headline is None else [f"[bold]accuracy[/] {shown(headline.text)}"]
+    return [] if headline is None else [f"[bold]accuracy[/] {literal(headline.text)}"]
 
 
 def cautions(by_stage: Mapping[str, Sequence[Remark]]) -> list[Renderable]:
+    """Return a line for each caution, with its stage and code."""
     return [
-        f"[bold yellow]caution:[/] {shown(caution.sentence)} ({stage}, {caution.code})"
+        f"[bold yellow]caution:[/] {literal(caution.text)} ({stage}, {caution.code})"
         for stage, of_stage in by_stage.items()
         for caution in of_stage
     ]
@@ -129,21 +203,37 @@ def _cameras(rows: Sequence[Mapping[str, Any]]) -> list[Renderable]:
         return []
     columns = {
         "camera": [str(row["camera_id"]) for row in rows],
-        "model": [shown(row["make_model"]) for row in rows],
-        "serial number": [shown(row["serial"]) for row in rows],
-        "sensor": [shown(row["sensor"]) for row in rows],
-        "lens": [shown(row["model"]) for row in rows],
+        "model": [literal(row["make_model"]) for row in rows],
+        "serial number": [literal(row["serial"]) for row in rows],
+        "sensor": [literal(row["sensor"]) for row in rows],
+        "lens": [literal(row["model"]) for row in rows],
         "size px": [f"{row['width']}×{row['height']}" for row in rows],
         "focal px": [f"{row['focal_px']:.1f}" for row in rows],
-        "from": [shown(row["focal_source"]) for row in rows],
+        "from": [literal(row["focal_source"]) for row in rows],
         "images": [str(row["images"]) for row in rows],
         "least sharp": ["" if row.get("least_sharp") is None else f"{row['least_sharp']:.2f}" for row in rows],
     }
     columns = {head: cells for head, cells in columns.items() if any(cells)}
-    numbers = [place for place, head in enumerate(columns) if head in ("focal px", "images", "least sharp")]
+    numbers = [index for index, head in enumerate(columns) if head in ("focal px", "images", "least sharp")]
     table = plain_table(*columns, right=numbers)
     for row in zip(*columns.values(), strict=True):
         table.add_row(*row)
+    return ["", table]
+
+
+def date_volumes(dates: Sequence[Mapping[str, Any]]) -> list[Renderable]:
+    """Return the table of the volumes of `georef change` at each date of a chain; none: there is no chain."""
+    if not dates:
+        return []
+    heads = ("date", "taken on", "region", "since the first (m³)", "since the date before (m³)")
+    table = plain_table(*heads, right=[3, 4])
+    for date in dates:
+        for region in date["regions"]:
+            since_first = f"{region['net_m3']:+.1f} ± {region['sigma_m3']:.1f}"
+            since_before = f"{region['since_previous_m3']:+.1f} ± {region['sigma_since_previous_m3']:.1f}"
+            table.add_row(
+                literal(date["name"]), date["taken_on"], literal(region["name"]), since_first, since_before
+            )
     return ["", table]
 
 
@@ -153,21 +243,22 @@ def outcome(workspace: Workspace, result: Outcome, *, headline: bool = True) -> 
     effort = duration(manifest.duration_s) if result.ran else "current, nothing to do"
     parts: list[Renderable] = []
     if headline:
-        parts.append(f"[bold]{result.stage}[/]: {shown(manifest.key_figure)} ({effort})")
+        parts.append(f"[bold]{result.stage}[/]: {literal(manifest.key_figure)} ({effort})")
     if result.stage == "evaluate":
         parts += report(read_report(workspace.path(REPORT)))
     elif manifest.values:
         table = plain_table("", "", header=False, right=[1])  # Nested values are shown by --json only.
         for name, value in manifest.values.items():
             if isinstance(value, str | int | float) or value is None:
-                table.add_row(shown(_words(name)), shown(_number(value)))
+                table.add_row(literal(_words(name)), literal(_number(value)))
         parts.append(table)
         parts += _cameras(manifest.values.get("camera_list", ()))
+        parts += date_volumes(manifest.values.get("by_date", ()))
     spec = BY_NAME.get(result.stage)  # None: a part of `blocks`, whose files only they read
     if spec is not None and (file := workspace.root / spec.product).exists():
-        parts.append(f"[bold]file[/] {shown(str(file))}")
+        parts.append(f"[bold]file[/] {literal(str(file))}")
     if not result.ran:  # the warnings of a stage that just ran are on stderr already
-        parts += [f"[yellow]warning:[/] {shown(warning.sentence)}" for warning in manifest.warnings]
+        parts += [f"[yellow]warning:[/] {literal(warning.text)}" for warning in manifest.warnings]
     return parts
 
 
@@ -187,9 +278,9 @@ def outcomes(results: Sequence[Outcome]) -> Table:
     for result in results:
         manifest = result.manifest
         done = "[green]done[/]" if result.ran else "[dim]current[/]"
-        table.add_row(result.stage, done, duration(manifest.duration_s), shown(manifest.key_figure))
+        table.add_row(result.stage, done, duration(manifest.duration_s), literal(manifest.key_figure))
         for warning in () if result.ran else manifest.warnings:
-            table.add_row("", "[yellow]warning[/]", "", shown(warning.sentence))
+            table.add_row("", "[yellow]warning[/]", "", literal(warning.text))
     return table
 
 
@@ -197,16 +288,18 @@ def comparison(table: Comparison) -> list[Renderable]:
     """Return the tables of `georef compare`: a line for each configuration, and its distinctive features below."""
     points = [f"{way}\n{ERRORS[name].label}" for way, name in POINT_FIGURES]
     heads = ("test\nPSNR", "PSNR\ncovered", "\nSSIM", *points, "check\npoints", "\ntraining")
-    rows = {shown(row.configuration): [shown(cell) for cell in cells(row)] for row in table.rows}
-    notes = [f"[bold]{shown(row.configuration)}[/] {shown(f'{row.title}: {row.note}')}" for row in table.rows]
-    compared = {shown(row.configuration): list(reference_cells(row)) for row in table.rows if row.reference}
+    rows = {literal(row.configuration): [literal(cell) for cell in cells(row)] for row in table.rows}
+    notes = [f"[bold]{literal(row.configuration)}[/] {literal(f'{row.title}: {row.note}')}" for row in table.rows]
+    compared = {literal(row.configuration): list(reference_cells(row)) for row in table.rows if row.reference}
     reference: list[Renderable] = [
         "",
         "[bold]Surface against the reference, metres[/]",
         figures(REFERENCE_HEADS, compared),
     ]
     remarks = [
-        f"[yellow]{shown(row.configuration)}:[/] {shown(text)}" for row in table.rows for text in remarks_on(row)
+        f"[yellow]{literal(row.configuration)}:[/] {literal(text)}"
+        for row in table.rows
+        for text in remarks_on(row)
     ]
     return [
         "[bold]Test views in dB, check points in metres[/]",
@@ -232,10 +325,10 @@ def topics(rows: Iterable[Mapping[str, Any]]) -> ByWidth:
             f"{row['backwards']} backwards" if row["backwards"] else "",
         ]
         remarks += ["no stamps" if row["clock"] == "recording" else "", row["problem"]]
-        name, messages, rate = shown(row["name"]), str(row["messages"]), _number(row["rate_hz"])
-        use = (f"[green]{shown(row['use'])}[/]", shown(", ".join(filter(None, remarks))))
-        kind, times = shown(row["type"].replace("/msg/", "/")), (duration(span), duration(row["longest_gap_s"]))
-        table.add_row(name, kind, messages, rate, *times, shown(row["frame"]), *use)
+        name, messages, rate = literal(row["name"]), str(row["messages"]), _number(row["rate_hz"])
+        use = (f"[green]{literal(row['use'])}[/]", literal(", ".join(filter(None, remarks))))
+        kind, times = literal(row["type"].replace("/msg/", "/")), (duration(span), duration(row["longest_gap_s"]))
+        table.add_row(name, kind, messages, rate, *times, literal(row["frame"]), *use)
         narrow.add_row(name, messages, rate, *use)
     return ByWidth(WIDE, table, narrow)
 
@@ -258,9 +351,10 @@ def report(document: EvaluationReport) -> list[Renderable]:
         _rows(f"{_CROSSED}, metres", {} if crossed is None else {"left out": dict(crossed)}, POINT_COLUMNS),
         None
         if crossed is None or crossed.reason is None
-        else Group(f"\n[bold]{_CROSSED}[/]", f"not possible: {shown(crossed.reason)}"),
-        *(Group(f"[bold]required accuracy[/] {shown(test.sentence)}") for test in document.tolerances),
+        else Group(f"\n[bold]{_CROSSED}[/]", f"not possible: {literal(crossed.reason)}"),
+        *(Group(f"[bold]required accuracy[/] {literal(test.sentence)}") for test in document.tolerances),
         *_against_reference(document.reference),
+        _held_out(document.held_out),
         _rows("Known distances, metres", _distances(document), DISTANCES),
         _rows("Predicted σ, metres", {} if cameras is None else {"cameras": dict(cameras)}, SIGMA_COLUMNS),
         _rows("Residuals of the fit (not an accuracy), metres", fit, POINT_COLUMNS),
@@ -291,9 +385,19 @@ def _against_reference(reference: ReferenceComparison | None) -> list[Group | No
     moved = "" if reference.aligned == "none" else f" after moving it ({reference.aligned})"
     columns = {key: key.replace(" ", "\n") for row in scores.values() for key in row if "threshold" not in key}
     return [
-        _rows(f"Model minus {shown(reference.name)}{moved} (M3C2, C2C), metres", distances, DISTANCE_COLUMNS),
+        _rows(f"Model minus {literal(reference.name)}{moved} (M3C2, C2C), metres", distances, DISTANCE_COLUMNS),
         _rows("Shares within 0.05, 0.1, 0.3 m", scores, columns),
     ]
+
+
+def _held_out(depths: HeldOutDepths | None) -> Group | None:
+    """Return the errors at measured points that the training was not given; None without any."""
+    if depths is None:
+        return None
+    columns = {key: figure.label for key, figure in DEPTH_ERRORS.items()}
+    rows = {"depth maps before": dict(depths.before), "trained model after": dict(depths.after)}
+    title = f"Errors at measured points, held out of the training ({depths.share:.0%}), metres"
+    return _rows(title, rows, columns)
 
 
 def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Group | None:
@@ -302,7 +406,7 @@ def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[st
     heads = {key: head for key, head in columns.items() if any(row.get(key) is not None for row in known.values())}
     if not heads:
         return None
-    cells = {shown(name): [shown(_number(row.get(key))) for key in heads] for name, row in known.items()}
+    cells = {literal(name): [literal(_number(row.get(key))) for key in heads] for name, row in known.items()}
     return Group(f"\n[bold]{title}[/]", figures(tuple(heads.values()), cells))
 
 
@@ -371,11 +475,11 @@ def coordinate_tables(report: EvaluationReport) -> list[Group]:
             ("triangulated", point.triangulated),
             ("surface", point.surface),
         ):
-            name = shown(point.name) if way == "surveyed" else ""
+            name = literal(point.name) if way == "surveyed" else ""
             table.add_row(name, way, *(text or MISSING for text in listed.texts(xyz)))
     units = listed.units[0] if len(set(listed.units)) == 1 else ", ".join(listed.units)
-    title = f"Check points in {shown(listed.crs)}, {shown(units)}; x is the easting or longitude"
-    return [Group(f"\n[bold]{title}[/]", table, f"Heights: {shown(listed.heights)}.")]
+    title = f"Check points in {literal(listed.crs)}, {literal(units)}; x is the easting or longitude"
+    return [Group(f"\n[bold]{title}[/]", table, f"Heights: {literal(listed.heights)}.")]
 
 
 def _table(lines: Sequence[PointLine], *, with_way: bool) -> Table:
@@ -388,7 +492,7 @@ def _table(lines: Sequence[PointLine], *, with_way: bool) -> Table:
         lengths = [MISSING] * 4 if error is None else [*(f"{value:+.3f}" for value in error), _length(error[:2])]
         predicted = [MISSING] * 2 if sigma is None else [_length(sigma[:2]), f"{sigma[2]:.3f}"]
         table.add_row(
-            shown(line.row.name),
+            literal(line.row.name),
             *([line.way] if with_way else []),
             str(line.row.rays),
             *lengths,

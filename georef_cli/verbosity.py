@@ -1,13 +1,18 @@
 """Verbosity of the program, the form of its log lines, and its messages for programs (`--json-progress`)."""
 
 import logging
+import os
+import select
 import signal
 import sys
+import threading
+import time
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, TextIO
 
-from pipelines.core.child import MessageSender
+from pipelines.core.child import ORPHAN_S, MessageSender
 from pipelines.core.sentences import printable, printable_lines
 
 
@@ -44,11 +49,18 @@ class LineFormatter(SafeFormatter):
 
 
 class StderrSender(MessageSender):
-    """Sender that interrupts its process when its reader is gone, as Ctrl-C does: nobody waits for the result."""
+    """Sender that interrupts its process when its reader is gone, as Ctrl-C does: nobody waits for the result.
+
+    The process ends soon, whatever it does: it may hold the lock of a folder, which the command that was killed
+    needs when it is given again.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__(stream)
         self._has_reader = True
+        if sys.platform != "win32":  # has no poll
+            with suppress(OSError, ValueError):  # a stream without a descriptor
+                threading.Thread(target=_end_without_reader, args=(stream.fileno(),), daemon=True).start()
 
     def send(self, kind: str, **content: Any) -> None:
         if not self._has_reader:
@@ -57,7 +69,18 @@ class StderrSender(MessageSender):
             super().send(kind, **content)
         except OSError:
             self._has_reader = False
-            signal.raise_signal(signal.SIGTERM)
+            if sys.platform == "win32":
+                signal.raise_signal(signal.SIGTERM)
+
+
+def _end_without_reader(descriptor: int) -> None:
+    """Wait until a pipe has lost its reader, and end this process; of what is no pipe, wait for ever."""
+    watched = select.poll()
+    watched.register(descriptor, 0)  # errors are always told
+    if any(event & (select.POLLERR | select.POLLHUP) for _, event in watched.poll()):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.8 * ORPHAN_S)
+        os._exit(1)
 
 
 @cache

@@ -11,17 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from pipelines.adjust.relative import Solved
+from pipelines.change.datum import load_epoch
 from pipelines.change.grid import MEASURED
-from pipelines.core.products import save_json
+from pipelines.core.products import load_json, save_json
+from pipelines.core.stages import COMMON_POINTS, MODEL
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import sidecar_path
 from pipelines.formats.geotiff import Band, RasterFrame, RasterKind, write_mosaic, write_part
 from pipelines.geodesy.vertical import parse_vertical
+from pipelines.survey.area import corners, scene_points
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.common_points import CommonPoints, solution_hash
 from pipelines.survey.options import CrsOptions
+from pipelines.survey.solution import TrainedModel, read_sfm, read_solution
 from pipelines.survey.target_crs import target_crs
-from pipelines.survey.trained_survey import corners, load_trained, scene_points
-from tests.trained_workspaces import trained_workspace
+from tests.once import fill_folder
+from tests.trained_workspaces import trained_workspace, write_adjustment
 
 SIDE, CELL_M, NOISE_M, GROUND_M = 360, 0.25, 0.03, 1600.0
 HOLE_CELLS = 3  # beside the eastern walls of the later epoch, which are interpolated
@@ -71,23 +78,32 @@ def town_pair(root: Path, *, changed: bool, half_cells: int = 1, shift_m: float 
     """
     before, _ = town_heights(changed=False)
     after, _ = town_heights(changed=changed)
+
+    def write(folder: Path) -> None:
+        write_dates(folder, before, changed=changed, half_cells=half_cells, shift_m=shift_m)
+
+    fill_folder(root, ("town", changed, half_cells, shift_m), write)
+    return TownPair(before, after, (Workspace(root / "spring"), Workspace(root / "autumn")))
+
+
+def write_dates(root: Path, before: FloatArray, *, changed: bool, half_cells: int, shift_m: float) -> None:
     seen, house = town_heights(changed=changed, half_cells=half_cells)
     hole = np.zeros(house.shape, dtype=bool)
     for shift in range(1, HOLE_CELLS + 1):
         hole[:, shift:] |= house[:, :-shift] & ~house[:, shift:]
     blurred = gaussian_filter(seen, HOLE_CELLS)
     rng = np.random.default_rng(1)
-    first = epoch_workspace(root / "spring", before, np.ones(before.shape, dtype=bool), rng)
-    second = epoch_workspace(root / "autumn", np.where(hole, blurred, seen) + shift_m, ~hole, rng)
-    return TownPair(before, after, (first, second))
+    epoch_workspace(root / "spring", before, np.ones(before.shape, dtype=bool), rng)
+    epoch_workspace(root / "autumn", np.where(hole, blurred, seen) + shift_m, ~hole, rng)
 
 
 def epoch_workspace(root: Path, height_m: FloatArray, measured: BoolArray, rng: np.random.Generator) -> Workspace:
     """Return a workspace with the rasters of a surface (H, W) with noise, and an orthophoto of its heights."""
     _, workspace = trained_workspace(root)
-    trained = load_trained(workspace)
+    solution, survey = read_solution(workspace), load_survey(workspace)
+    box = corners(scene_points(solution, read_sfm(workspace, solution)))
     options = CrsOptions(crs="EPSG:32632", vertical=parse_vertical("ellipsoidal"))
-    target = target_crs(options, trained.survey.origin, corners(scene_points(trained)), trained.survey.vertical)
+    target = target_crs(options, survey.origin, box, survey.vertical)
     east, north, _ = target.xyz_from_geo(np.zeros((1, 3)))[0].tolist()
     rows, columns = height_m.shape
     west, top = east - columns * CELL_M / 2, north + rows * CELL_M / 2
@@ -119,3 +135,31 @@ def _kind(cells: NDArray[Any]) -> RasterKind:
     colours: tuple[Literal["Red", "Green", "Blue", "Alpha"], ...] = ("Red", "Green", "Blue", "Alpha")
     bands = tuple(Band(name, colour=name) for name in colours) if len(cells) == 4 else (Band("value"),)
     return RasterKind("uint8" if cells.dtype == np.uint8 else "float32", bands)
+
+
+def tie(after: Workspace, before: Workspace) -> None:
+    """Adjust an epoch onto another, all points of which it has in common."""
+    epoch = load_epoch(before)
+    date = Solved(epoch.posterior, epoch.survey.origin_on_earth)
+    ids = epoch.posterior.sparse.point_id
+    position, cov = date.placed(ids)
+    similarity, pivot = date.similarity_in_ecef
+    CommonPoints(
+        point_id=ids,
+        earlier_point_id=ids,
+        matches=np.full(len(ids), 3),
+        position_in_ecef=position,
+        cov_in_ecef=cov,
+        sigma_m=date.sigma_m,
+        cov_similarity=similarity,
+        pivot_in_ecef=pivot,
+        spread=np.asarray(1.0),
+        found=np.asarray(len(ids)),
+        factor=np.asarray(1.0),
+        checked=np.asarray(True),
+        earlier=str(before.root),
+        solution=solution_hash(before),
+    ).save(after.root / COMMON_POINTS)
+    model = load_json(TrainedModel, after.path(MODEL))
+    save_json(model.model_copy(update={"tied": True}), after.root / MODEL)
+    write_adjustment(after)

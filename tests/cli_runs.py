@@ -9,9 +9,12 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipelines.core.sentences import printable
+
+if TYPE_CHECKING:
+    from tests.forked import ForkedProcess
 
 REPOSITORY = Path(__file__).parents[1]
 WITH_FAKES = "from tests import fakes; fakes.install(); from georef_cli.main import main; main()"
@@ -43,7 +46,7 @@ class Result:
         if self.out:
             assert set(self.document) == {"error"}
             error = self.document["error"]
-            assert set(error) == {"kind", "code", "message", "path", "line", "field", "hint"}
+            assert set(error) == {"kind", "code", "message", "path", "line", "field", "remedy"}
             assert (error["kind"] == "usage") is (code == 2)
             assert printable(error["message"]) in self.err
 
@@ -62,9 +65,10 @@ def start(*arguments: object, code: str = WITH_FAKES) -> subprocess.Popen[str]:
     )
 
 
-def finish(process: subprocess.Popen[str], patience_s: float = 60.0) -> Result:
+def finish(process: subprocess.Popen[str] | ForkedProcess, patience_s: float = 60.0) -> Result:
     """Wait for a process."""
     out, err = process.communicate(timeout=patience_s)
+    assert process.returncode is not None
     return Result(process.returncode, out, err)
 
 

@@ -2,32 +2,74 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from filelock import FileLock, Timeout
 
 from pipelines.core.stages import BY_NAME, STAGES
 from pipelines.core.workspace import Workspace
 from tests import fakes
+from tests.children import run_here
+from tests.once import make_once
 
 if TYPE_CHECKING:
     from tests.splat_scenes import RenderedFlight
 
-# Two: a third one hardly moves a mean. The squared errors of the similarity are 4.3 and 3.5 (the third 3.8), and
-# what the geographic losses gain in quality is 0.27 and 0.08 dB (the third 0.09 dB).
+# Two: a third one hardly moves a mean. The squared errors of the similarity are 4.3 and 3.5 (the third 3.8).
 SEEDS = 2
 
 # As the command line does, and for the same reason: see georef_cli/main.py.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+# Files that take longest, the longest first, of the fast tests and of the slow ones.
+LONGEST = (
+    "cli/test_kill_matrix.py",
+    "cli/test_falsified_surveys.py",
+    "train/test_train.py",
+    "faults/test_full_disk.py",
+    "cli/test_batch_cluster.py",
+    "adjust/test_monte_carlo.py",
+    "cli/test_current_folder.py",
+    "adjust/test_drift.py",
+    "cli/test_kill.py",
+    "adjust/test_sessions.py",
+    "train/test_train_on_gsplat.py",
+    "cli/test_documented_commands.py",
+    "cli/test_blocks_cluster.py",
+    "faults/test_faults.py",
+    "cli/test_bad_products.py",
+    "simulate/test_simulate.py",
+    "splat/rasterizer/test_cpu.py",
+    "ingest/test_targets.py",
+    "deliver/raster/test_raster.py",
+    "sfm/test_known_poses.py",
+    "splat/test_losses.py",
+    "sfm/test_sfm.py",
+    "test_package.py",
+    "fuzz/test_fuzz.py",
+    "deliver/raster/test_pictures.py",
+    "cli/test_webodm.py",
+    "view/test_saved.py",
+    "cli/test_compare.py",
+)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let several processes begin with the longest files: one that begins last is waited for by all."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    rank = {Path(__file__).parent / name: number for number, name in enumerate(LONGEST)}
+    count = Counter(item.path for item in items)
+    items.sort(key=lambda item: (rank.get(item.path, len(rank)), -count[item.path]))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -36,6 +78,14 @@ def heard_interrupts() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def unflushed_files() -> Iterator[None]:
+    """Let the system write files to the disk when it likes: no test cuts the power, and flushes are waited for."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _descriptor: None)
+        yield
 
 
 @pytest.fixture
@@ -56,6 +106,13 @@ def workspace(tmp_path: Path) -> Workspace:
 def photos(tmp_path: Path) -> Path:
     """A folder that stands for one of photographs."""
     return fakes.photographs(tmp_path / "photos")
+
+
+@pytest.fixture
+def children_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Native code works in this process, for tests of what it does and not of where."""
+    for module in ("sfm.stage", "sfm.prior_adjustment", "surface.poisson"):
+        monkeypatch.setattr(f"pipelines.{module}.run_in_child", run_here)
 
 
 @pytest.fixture
@@ -104,7 +161,7 @@ def trained(flights: list[RenderedFlight], between_processes: Path) -> list[tupl
 
     def train(flight: RenderedFlight, geo_loss: bool, made: Path) -> None:
         workspace = flight.workspace(made.name)
-        run_stage(workspace, BY_NAME["train"], {**TRAINING, "geo_loss": geo_loss})
+        run_stage(workspace, BY_NAME["train"], {**TRAINING, "georeference": "joint" if geo_loss else "frozen"})
         shutil.copytree(workspace.root, made, symlinks=True)
 
     tasks = {
@@ -129,15 +186,3 @@ def finished(between_processes: Path) -> Workspace:
     root = between_processes / "finished" / "ws"
     make_once({root: make_finished})
     return Workspace(root)
-
-
-def make_once(tasks: Mapping[Path, Callable[[Path], None]]) -> None:
-    """Call each function with the path of what it makes, unless another process of this run has, or does."""
-    for wait in (False, True):  # first what nobody has begun
-        for made, make in tasks.items():
-            made.parent.mkdir(exist_ok=True)
-            done = made.with_name(f"{made.name}.done")
-            with contextlib.suppress(Timeout), FileLock(f"{made}.lock", blocking=wait):
-                if not done.exists():
-                    make(made)
-                    done.touch()

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.adjust.geolocate import geolocate
-from pipelines.adjust.init_sim3 import Estimated, estimate_similarity
+from pipelines.adjust.init_sim3 import estimate_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
+from pipelines.adjust.posterior import Posterior
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
@@ -84,15 +85,15 @@ class Solved:
 
     scene: TrueScene
     model: SparseModel
-    estimated: Estimated
+    posterior: Posterior
 
     @property
     def codes(self) -> set[str]:
-        return {caution.code for caution in self.estimated.initial.cautions}
+        return {caution.code for caution in self.posterior.solution.cautions}
 
     @property
     def geo_from_local(self) -> Similarity:
-        return Similarity.from_record(self.estimated.posterior.solution.similarity_from_local())
+        return Similarity.from_record(self.posterior.solution.similarity_from_local())
 
     @property
     def tilt_rad(self) -> np.ndarray:
@@ -102,7 +103,7 @@ class Solved:
 
     @property
     def cov_of_tilt(self) -> np.ndarray:
-        return self.estimated.posterior.of_similarity[1:3, 1:3]
+        return self.posterior.of_similarity[1:3, 1:3]
 
     @property
     def normalised(self) -> float:
@@ -117,4 +118,5 @@ def solved(of: Drift, seed: int) -> Solved:
     model = sparse_model(scene, Noise(pixel_px=0.3), rng)
     survey = survey_with(of, scene, rng)
     points = geolocate(survey, model, GeolocateOptions()).points
-    return Solved(scene, model, estimate_similarity(survey, model, points, InitSim3Options()))
+    posterior, _ = estimate_similarity(survey, model, points, InitSim3Options())
+    return Solved(scene, model, posterior)

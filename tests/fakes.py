@@ -33,18 +33,14 @@ def write_products(stage: StageRun, spec: StageSpec, text: str) -> None:
 
 def read_products(workspace: Workspace, spec: StageSpec) -> list[str]:
     """The texts of all products of a finished stage."""
-    texts = []
-    for product in products_of(spec):
-        path = workspace.path(product)
-        texts.append((path if path.is_file() else path / "content.txt").read_text(encoding="utf-8"))
-    return texts
+    return [_text_of(workspace.path(product)) for product in products_of(spec)]
 
 
 def fake_run(spec: StageSpec) -> Run:
     """The `run` of a fake stage."""
 
     def run(stage: StageRun, options: StageOptions) -> Summary:
-        read = "".join(read_products(stage.workspace, s)[0] for s in PIPELINE if _reads(spec, s))
+        read = "".join(_text_of(stage.workspace.path(s.product)) for s in PIPELINE if _reads(spec, s))
         document = {"stage": spec.name, "options": options.model_dump(mode="json"), "read": _digest(read)}
         text = _in_form(spec, json.dumps(document, separators=(",", ":")))
         with stage.progress.task(spec.name, 2) as task:
@@ -81,6 +77,10 @@ def _in_form(spec: StageSpec, text: str) -> str:
     from tests.reports import report_with
 
     return dump_json(report_with(cautions=(Remark(code="fake", sentence=text),)).model_dump(mode="json"))
+
+
+def _text_of(path: Path) -> str:
+    return (path if path.is_file() else path / "content.txt").read_text(encoding="utf-8")
 
 
 def _digest(text: str) -> str:

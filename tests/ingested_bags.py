@@ -30,4 +30,4 @@ def check(survey: Survey, flight: bags.Flight, *, tolerance_m: float = 1e-3, att
 def remarked(survey: Survey, code: str, *parts: str) -> bool:
     """Whether a warning or an assumption has the code and all parts (numbers, topics, files)."""
     remarks = (*survey.warnings, *survey.assumptions)
-    return any(one.code == code and all(part in one.sentence for part in parts) for one in remarks)
+    return any(one.code == code and all(part in one.text for part in parts) for one in remarks)

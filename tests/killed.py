@@ -15,7 +15,8 @@ import numpy as np
 import torch
 
 from pipelines.splat.gaussians import read_gaussians
-from tests.cli_runs import Result, finish, start
+from tests.cli_runs import Result, finish
+from tests.forked import start_georef
 
 GEOREF = "from georef_cli.main import main; main()"
 ONE_THREAD = ("--threads", "1")  # makes each product the same in every run
@@ -48,14 +49,14 @@ def make_finished(workspace: Path) -> None:
 
 def georef(*words: object) -> Result:
     """Run a command to its end, which must be a good one."""
-    done = finish(start(*words, code=GEOREF), PATIENCE_S)
+    done = finish(start_georef(*words), PATIENCE_S)
     assert done.code == 0, done.err
     return done
 
 
 def killed(words: tuple[object, ...], begun: Callable[[], bool], after_s: float) -> bool:
     """Run a command, and kill it some time after it has begun; return whether it was killed before its end."""
-    process = start(*words, code=GEOREF)
+    process = start_georef(*words)
     deadline = time.monotonic() + PATIENCE_S
     while process.poll() is None and not begun():
         assert time.monotonic() < deadline

@@ -8,7 +8,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pipelines.formats.bag_limits import DEFINITIONS
+from pipelines.formats.px4_messages import DEFINITIONS
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.rotations import ENU_FROM_NED, quat_xyzw_from_matrix
 from tests.bags import ORIGIN, TYPES, Flight, Message, at_place, make

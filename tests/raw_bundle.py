@@ -12,10 +12,10 @@ from functools import cached_property
 
 import numpy as np
 
-from pipelines.adjust.posterior import IntersectionJacobian, intersection_jacobian
 from pipelines.adjust.system import NormalMatrix
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InputError
 from pipelines.core.types import FloatArray, IntArray
+from pipelines.geometry.intersection import IntersectionJacobian, intersection_jacobian
 from pipelines.geometry.network import (
     Network,
     eliminate_points,

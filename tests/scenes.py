@@ -20,9 +20,9 @@ from pipelines.geometry.cameras import Camera, CameraPoses, project
 from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.adjustment import SimilarityEstimate
+from pipelines.survey.solution import SolvedCamera, TrainedModel
 from pipelines.survey.survey import Attitude, CameraPrior, Fix, FixSession, Mark, Survey, SurveyedPoint, SurveyImage
-from pipelines.survey.trained_model import TrainedCamera, TrainedModel
 
 CAMERA = Camera("OPENCV", 1200, 900, np.array([1020.0, 1018.0, 603.0, 447.0, -0.045, 0.012, 3e-4, -2e-4]))
 GEO_FROM_LOCAL = Similarity(12.5, exp_so3([0.4, -1.1, 2.0]), np.array([30.0, -45.0, 70.0]))
@@ -221,15 +221,15 @@ def material(
     return scene, sparse_model(scene, noise, rng), survey
 
 
-def initial(layout: str = "volume") -> InitialSimilarity:
+def initial(layout: str = "volume") -> SimilarityEstimate:
     """Return the true similarity, with σ of 1 % of scale, 0.01 rad and 1 cm about a place in the scene."""
     covariance, pivot = np.eye(7) * 1e-4, (5.0, -3.0, 60.0)
     return initial_product(GEO_FROM_LOCAL.to_record("local", "geo", covariance=covariance, pivot=pivot), layout)
 
 
-def initial_product(geo_from_local: SimilarityRecord, layout: str = "volume") -> InitialSimilarity:
-    """Return the product of `init-sim3` for a similarity, without counts of correspondences and residuals."""
-    return InitialSimilarity(
+def initial_product(geo_from_local: SimilarityRecord, layout: str = "volume") -> SimilarityEstimate:
+    """Return a similarity as `init-sim3` states it, without counts of correspondences and residuals."""
+    return SimilarityEstimate(
         geo_from_local=geo_from_local,
         method="robust",
         correspondences={},
@@ -243,12 +243,12 @@ def initial_product(geo_from_local: SimilarityRecord, layout: str = "volume") ->
 
 def trained_cameras(
     names: Sequence[str], poses: CameraPoses, test: Collection[int] = ()
-) -> tuple[TrainedCamera, ...]:
+) -> tuple[SolvedCamera, ...]:
     """Return cameras as a product, of poses in `model`."""
     quats = quat_xyzw_from_matrix(poses.cam_from_model)
     shift = -np.einsum("nij,nj->ni", poses.cam_from_model, poses.cam_center_in_model)
     return tuple(
-        TrainedCamera(
+        SolvedCamera(
             name=name,
             split="test" if index in test else "train",
             quat_xyzw=tuple(quats[index].tolist()),
@@ -263,7 +263,7 @@ def trained_model(
     model_from_local: Similarity = IDENTITY,
     *,
     max_image_size: int = 320,
-    cameras: tuple[TrainedCamera, ...] = (),
+    cameras: tuple[SolvedCamera, ...] = (),
 ) -> TrainedModel:
     """Return the product that `train` writes beside a single Gaussian without bands."""
     return TrainedModel(

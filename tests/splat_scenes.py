@@ -14,7 +14,7 @@ from pipelines.adjust.init_sim3 import estimate_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
 from pipelines.adjust.posterior import save_posterior
 from pipelines.core.products import load_json, save_json, save_npz
-from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3, SIM3_POSTERIOR, SPARSE, SURVEY
+from pipelines.core.stages import ADJUSTMENT, POINTS, SIM3_POSTERIOR, SPARSE, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import Camera, Pinhole
@@ -40,7 +40,7 @@ SPACING_M, SIGMA_M = 1.6, 0.9
 NOISE = Noise(fix_m=(0.05, 0.05, 0.08), pixel_px=0.1, mark_px=0.1, gcp_m=1e-4)
 TEST_VIEWS = (3, 9)
 # Too few for density control, which would turn differences of rounding into differences of tenths of a dB.
-TRAINING = {"iterations": 150, "sh_degree": 0, "log_every": 5}
+TRAINING = {"georeference": "joint", "iterations": 150, "sh_degree": 0, "log_every": 5}
 
 
 @dataclass(frozen=True)
@@ -140,10 +140,9 @@ def adjust_workspace(workspace: Workspace, options: InitSim3Options | None = Non
     survey, sparse = load_json(Survey, workspace.path(SURVEY)), read_sparse(workspace.path(SPARSE))
     points = geolocate(survey, sparse, GeolocateOptions()).points
     save_npz(workspace.root / POINTS, vars(points))
-    estimated = estimate_similarity(survey, sparse, points, options or InitSim3Options())
-    save_json(estimated.initial, workspace.root / SIM3)
-    save_json(estimated.posterior.solution, workspace.root / ADJUSTMENT)
-    save_posterior(estimated.posterior, workspace.root / SIM3_POSTERIOR)
+    posterior, _ = estimate_similarity(survey, sparse, points, options or InitSim3Options())
+    save_json(posterior.solution, workspace.root / ADJUSTMENT)
+    save_posterior(posterior, workspace.root / SIM3_POSTERIOR)
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ from pipelines.adjust.options import GeolocateOptions, InitSim3Options
 from pipelines.core.products import Remark
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import InitialSimilarity
-from pipelines.survey.marks import mark_rays
+from pipelines.survey.marks import mark_rays, triangulated_points
+from pipelines.survey.solution import Solution
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_survey import SolvedSurvey, triangulated_points
 
 
 @dataclass(frozen=True)
@@ -25,19 +24,19 @@ class Statement:
     Attributes:
         position_in_geo: (J, 3) by camera.
         cov_in_geo: (J, 3, 3) predicted.
-        initial: product of `init-sim3`.
+        solution: product of `init-sim3`.
         warnings: of `init-sim3`.
     """
 
     position_in_geo: np.ndarray
     cov_in_geo: np.ndarray
-    initial: InitialSimilarity
+    solution: Solution
     warnings: tuple[Remark, ...]
 
     @property
     def cautions(self) -> tuple[Remark, ...]:
         """Cautions of the result."""
-        return self.initial.cautions
+        return self.solution.cautions
 
     @property
     def codes(self) -> set[str]:
@@ -63,13 +62,13 @@ def state(survey: Survey, model: SparseModel, options: InitSim3Options | None = 
         GeorefError: a stage refuses the survey.
     """
     points = geolocate(survey, model, GeolocateOptions()).points
-    estimated = estimate_similarity(survey, model, points, options or InitSim3Options())
-    posterior, weighted = estimated.posterior, estimated.initial.weighted(survey)
+    posterior, warnings = estimate_similarity(survey, model, points, options or InitSim3Options())
+    weighted = posterior.solution.weighted(survey)
     rays = mark_rays(weighted.check_points, posterior.sparse)
-    position = triangulated_points(SolvedSurvey(weighted, model, posterior.solution), rays)
-    return Statement(position, posterior.of_marked_points(position, rays), estimated.initial, estimated.warnings)
+    position = triangulated_points(posterior.solution, rays)
+    return Statement(position, posterior.of_marked_points(position, rays), posterior.solution, warnings)
 
 
 def geo_from_local(statement: Statement) -> Similarity:
     """Return the similarity of a statement."""
-    return Similarity.from_record(statement.initial.geo_from_local)
+    return Similarity.from_record(statement.solution.similarity_from_local())

@@ -15,12 +15,14 @@ from tests.photos import jpeg
 
 # The shortest training that leaves a splat: the statement of accuracy does not depend on its photographs.
 QUICK = """[train]
-iterations = 60
+iterations = 10
 max_image_size = 48
 max_gaussians = 200
 sh_degree = 0
 dense = false
 exposure = false
+[evaluate]
+renders = 0
 """
 
 

@@ -43,8 +43,8 @@ def test_table_and_page_say_what_the_products_say(finished: Workspace, tmp_path:
     assert re.search(r"\[A flight\]\(#a-flight\) \| – \|.*\| failed \|", page)
     assert (tmp_path / f"real_{flight.name}.jpg").stat().st_size > 500
     assert "## Not run" in page and "/home/" not in page
-    for sentence in real_flights.remarks(real_flights.figures_of(finished.root)):
-        assert real_flights.plain(sentence) in page
+    for code in real_flights.remarks(real_flights.figures_of(finished.root)).values():
+        assert f"`{code}`" in page
 
 
 def test_a_flight_that_fails_is_recorded_with_its_error(tmp_path: Path) -> None:
@@ -61,3 +61,10 @@ def test_the_digest_tells_photographs_apart(tmp_path: Path) -> None:
     renamed = real_flights.digest(tmp_path)
     (tmp_path / "b.jpg").write_bytes(b"2")
     assert len({before, renamed, real_flights.digest(tmp_path)}) == 3
+
+
+def test_remarks_of_most_flights_are_said_once() -> None:
+    """A code of more than half of the flights is common; of two flights, none is."""
+    first, second, third = {"a 1": "a", "b 1": "b"}, {"a 2": "a"}, {"c 3": "c", "a 3": "a"}
+    assert real_flights.common_remarks([first, second, third]) == {"a"}
+    assert real_flights.common_remarks([first, second]) == set()

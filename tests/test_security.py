@@ -28,15 +28,19 @@ from pipelines.survey.survey import FixSession, Survey
 from tests.photos import Exif, gps_entries, jpeg, write_flight
 from tests.refusals import numbers, refused, said
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, write_workspace
+from tests.test_architecture import calls, imports, keyword, sources
 
 REPOSITORY = Path(__file__).parents[1]
 FORBIDDEN = {
-    "eval", "exec", "compile", "pickle", "marshal", "shelve", "yaml", "subprocess", "os.system", "os.popen",
+    "eval", "exec", "compile", "pickle", "marshal", "shelve", "dill", "yaml", "subprocess", "os.system", "os.popen",
     "torch.save",
 }  # fmt: skip
 # Readers that unpickle unless they are told not to, and how they are told.
-PICKLING = {"np.load": ("allow_pickle", "False"), "numpy.load": ("allow_pickle", "False"),
-            "torch.load": ("weights_only", "True")}  # fmt: skip
+PICKLING = {
+    "np.load": ("allow_pickle", False),
+    "numpy.load": ("allow_pickle", False),
+    "torch.load": ("weights_only", True),
+}
 # The files that start a process: this program again, for native code and for jobs; the user's browser; the
 # compilers of the CUDA kernels, which are asked for their versions; and Python, which calls them, and pip.
 STARTS_ITSELF = REPOSITORY / "pipelines/core/child.py"
@@ -51,33 +55,17 @@ STARTERS = (STARTS_ITSELF, STARTS_JOBS, STARTS_A_BROWSER, STARTS_A_COMPILER, ASK
 ESCAPES = ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg", "", "a\nb.jpg", "a\x00b.jpg"]
 
 
-def _calls(tree: ast.AST) -> list[tuple[str, ast.AST]]:
-    """Names that are called or imported."""
-    found: list[tuple[str, ast.AST]] = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call):
-            found.append((ast.unparse(node.func), node))
-        elif isinstance(node, ast.Import):
-            found += [(alias.name, node) for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            found.append((node.module or "", node))
-    return found
-
-
-@pytest.mark.parametrize("package", ["georef_cli", "pipelines"])
-def test_nothing_that_is_read_can_be_executed(package: str) -> None:
-    files = list((REPOSITORY / package).rglob("*.py"))
-    assert files
-    for file in files:
-        for name, node in _calls(ast.parse(file.read_text("utf-8"))):
-            if name == "subprocess" and file in STARTERS:
-                continue
-            assert name not in FORBIDDEN, f"{file}:{node.lineno} uses {name}"  # type: ignore[attr-defined]
+def test_nothing_that_is_read_can_be_executed() -> None:
+    starters = {".".join(file.relative_to(REPOSITORY).with_suffix("").parts) for file in STARTERS}
+    assert starters <= set(sources())
+    for module in sources():
+        of_imports = {part for name in imports(module) for part in (name, name.rpartition(".")[0])}
+        used = FORBIDDEN & (of_imports | {name for name, _ in calls(module)})
+        assert used <= ({"subprocess"} if module in starters else set()), f"{module} uses {used}"
+        for name, call in calls(module):
             if name in PICKLING:
-                assert isinstance(node, ast.Call)
                 option, safe = PICKLING[name]
-                said_so = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
-                assert said_so.get(option) == safe, f"{file}:{node.lineno} may unpickle"
+                assert keyword(call, option) is safe, f"{module}:{call.lineno} may unpickle"
 
 
 @pytest.mark.parametrize(
@@ -96,8 +84,8 @@ def test_only_this_python_and_named_programs_are_started(
     file: Path, arguments: str, environment: str | None
 ) -> None:
     """No module of the current folder is imported by a Python that is started: `pipelines.core.child`."""
-    calls = [node for name, node in _calls(ast.parse(file.read_text("utf-8"))) if "subprocess" in name]
-    (call,) = [node for node in calls if isinstance(node, ast.Call)]
+    module = ".".join(file.relative_to(REPOSITORY).with_suffix("").parts)
+    (call,) = [call for name, call in calls(module) if "subprocess" in name]
     assert ast.unparse(call.args[0]).startswith(arguments)
     options = {str(keyword.arg): ast.unparse(keyword.value) for keyword in call.keywords}
     assert "shell" not in options and options.get("env") == environment
@@ -195,7 +183,7 @@ def test_a_model_with_images_of_another_survey_is_not_read_from(workspace: Works
     fewer = survey.model_copy(update={"images": survey.images[1:]})
     with refused("images-not-in-survey", InputError) as error:
         photographs(model, fewer, workspace, 64)
-    assert numbers(error.value.message)[0] == 1 and "sfm --import" in error.value.message
+    assert numbers(error.value.message)[0] == 1 and "sfm --import" in error.value.remedy
 
 
 def test_cached_photographs_are_named_by_hash(tmp_path: Path, workspace: Workspace) -> None:
@@ -216,7 +204,7 @@ def test_a_photograph_that_is_gone_is_told(workspace: Workspace) -> None:
     survey = load_json(Survey, workspace.path(SURVEY))
     with refused("photograph-missing", InputError) as error:
         photographs(read_sparse(workspace.path(SPARSE)), survey, workspace, 64).build()
-    assert "No such file" in error.value.message and "georef ingest" in error.value.message
+    assert "No such file" in error.value.message and "georef ingest" in error.value.remedy
 
 
 def _points(count: int) -> dict[str, np.ndarray]:

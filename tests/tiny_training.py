@@ -20,8 +20,8 @@ from pipelines.splat.outlier_pixels import OutlierPixels
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.survey.photographs import ImageCache, Photograph
-from pipelines.train.geographic.problem import GeoProblem
-from pipelines.train.geographic.unknowns import CameraCorrections, LearnableSimilarity
+from pipelines.train.georeference.problem import GeoProblem
+from pipelines.train.georeference.unknowns import SolutionUnknowns
 from pipelines.train.schedule import JointOptions
 from pipelines.train.trainer import JointTrainer, TrainingViews
 
@@ -76,15 +76,13 @@ def trainer(
     start = true_gaussians(count)
     start = replace(start, log_scales=start.log_scales - 0.5, sh=torch.zeros_like(start.sh))
     train = np.arange(len(images))
-    similarity = LearnableSimilarity(Similarity(), np.eye(7) * 1e-4, np.zeros(3))
-    cameras = CameraCorrections.frozen(
-        poses(len(images)), State(Similarity(), np.zeros((len(images), 6)), np.zeros(0))
-    )
+    state = State(Similarity(), np.zeros((len(images), 6)), np.zeros(0))
+    unknowns = SolutionUnknowns.frozen(poses(len(images)), state)
     exposures = Exposures(torch.eye(3, 4).repeat(len(images), 1, 1), torch.from_numpy(train), options.iterations)
     return JointTrainer(
         GaussianAdam(start, EXTENT_M, options.iterations),
         strategy or DefaultStrategy(SETTINGS, EXTENT_M, len(start)),
-        GeoProblem(similarity, cameras),
+        GeoProblem(unknowns, len(images)),
         TrainingViews(train, images),
         rasterizer=CpuRasterizer(),
         options=options,

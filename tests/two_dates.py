@@ -9,8 +9,9 @@ from functools import cache
 import numpy as np
 
 from pipelines.adjust.geolocate import geolocate
-from pipelines.adjust.init_sim3 import Estimated, estimate_similarity
+from pipelines.adjust.init_sim3 import estimate_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
+from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.relative import Solved
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_enu_rotation, enu_from_ecef, lla_of
 from pipelines.geometry.intersection import refined_points
@@ -18,7 +19,7 @@ from pipelines.geometry.network import Network
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.common_points import CommonPoints
 from pipelines.survey.survey import Fix, FixSession, Survey
-from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, noisy, pixels, readjusted, size
+from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, jacobian, noisy, pixels, readjusted, size
 from tests.drawn_surveys import rows_of
 from tests.scenes import Measured, Noise, material
 
@@ -47,15 +48,15 @@ class Date:
     truth: Network
     survey: Survey
     model: SparseModel
-    estimated: Estimated
+    posterior: Posterior
 
     @property
     def solved(self) -> Solved:
-        return Solved(self.estimated.posterior, self.survey.origin_on_earth)
+        return Solved(self.posterior, self.survey.origin_on_earth)
 
     def seen(self, place: np.ndarray) -> np.ndarray:
         """Return Earth-centred places (J, 3) that the solution gives points of HERE which all photographs see."""
-        posterior, origin = self.estimated.posterior, self.survey.origin_on_earth
+        posterior, origin = self.posterior, self.survey.origin_on_earth
         true = marked(enu_from_ecef(ecef_from_enu(place, HERE), origin), self.truth)
         poses = posterior.solution.poses
         rays = replace(
@@ -115,19 +116,39 @@ def draw_date(
     common: CommonPoints | None = None,
     moved: tuple[int, ...] = (),
     by_m: float = 0.0,
+    k1_wrong: float = 0.0,
     changed: Callable[[Survey], Survey] = lambda survey: survey,
 ) -> Date:
-    """Return a date with noise of pixels and positions, solved by `init-sim3`; `seed` places its cameras."""
+    """Return a date with noise of pixels and positions, solved by `init-sim3`; `seed` places its cameras.
+
+    SfM has held the lens, with a radial distortion that is wrong by a share `k1_wrong`, if that is not 0.
+    """
     truth = true_date(seed, origin, moved, by_m)
     drawn, network = noisy(truth, rng), truth
     for _ in range(3):  # a weak lens moves far enough for second-order terms to count
         left = drawn.obs_xy_px - pixels(network, np.zeros(size(network)))
         step = _adjuster(seed, origin, moved, by_m) @ left.ravel()
         network = replace(readjusted(network, step), obs_xy_px=drawn.obs_xy_px)
+    if k1_wrong:
+        network = _of_wrong_lens(replace(drawn, cameras=truth.cameras), k1_wrong)
     survey = changed(_survey(truth, receiver, origin, rng)).model_copy(update={"common": common})
     model = _sparse(network, survey)
     points = geolocate(survey, model, GeolocateOptions()).points
-    return Date(truth, survey, model, estimate_similarity(survey, model, points, InitSim3Options()))
+    posterior, _ = estimate_similarity(survey, model, points, InitSim3Options())
+    return Date(truth, survey, model, posterior)
+
+
+def _of_wrong_lens(network: Network, share: float) -> Network:
+    """Return a network whose poses and points fit its pixels with a wrong lens: its ground is domed."""
+    lens = network.cameras[1]
+    params = lens.params * np.array([1.0, 1.0, 1.0, 1.0 + share])
+    network, observed = replace(network, cameras={1: replace(lens, params=params)}), network.obs_xy_px
+    for _ in range(2):
+        design = jacobian(network)[:, : -len(params)]
+        left = observed - pixels(network, np.zeros(size(network)))
+        step = np.linalg.lstsq(design, left.ravel(), rcond=1e-9)[0]  # of least norm: the gauge is free
+        network = readjusted(network, np.concatenate([step, np.zeros(len(params))]))
+    return network
 
 
 def _survey(truth: Network, receiver: Receiver, origin: Origin, rng: np.random.Generator) -> Survey:

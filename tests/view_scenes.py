@@ -13,11 +13,12 @@ from pipelines.core.stages import GAUSSIANS, MODEL
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
-from pipelines.splat.gaussians import Gaussians, write_gaussians
+from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import load_trained
+from pipelines.survey.solution import read_sfm, read_trained
 from tests.scenes import GEO_FROM_LOCAL, trained_cameras, trained_model
 from tests.splat_scenes import (
     CAMERA,
@@ -78,6 +79,7 @@ def viewed_workspace(root: Path, rendered: Rendered) -> Workspace:
 
 def renderer_of(workspace: Workspace) -> ModelRenderer:
     """Return the renderer of a workspace's model."""
-    trained = load_trained(workspace)
-    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-    return ModelRenderer(trained, images, CpuRasterizer())
+    model = read_trained(workspace)
+    sfm, gaussians = read_sfm(workspace, model), read_gaussians(workspace.path(GAUSSIANS))
+    images = photographs(sfm, load_survey(workspace), workspace, model.max_image_size)
+    return ModelRenderer(model, sfm, gaussians, images, CpuRasterizer())

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 from blocks import copied, georef
+from fitted_cost import fitted_cost, work_of
 
 from pipelines.core.products import load_json
-from pipelines.jobs.costs import IterationCost
 from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
 
 # Blocks, Gaussians of the whole, longest side of the photographs.
@@ -27,7 +27,7 @@ def measured(workspace: Path, scratch: Path, iterations: int) -> list[tuple[Plan
     for count, gaussians, size in _SIZES:
         place = copied(workspace, scratch / f"{count}-{gaussians}-{size}", scratch / "cache")
         georef(
-            *("blocks", "train", place, "--blocks", count, "--max-gaussians", gaussians, "--max-image-size", size),
+            *("train", place, "--blocks", count, "--max-gaussians", gaussians, "--max-image-size", size),
             *("--iterations", iterations, "--log-every", 2, "--no-dense", "--no-coarse-to-fine", "--threads", 1),
         )
         blocks += [
@@ -53,25 +53,25 @@ def main() -> None:
     in_plan = np.column_stack([[planned.view_px for planned, _ in blocks], visible, sizes[:, 2]])
     seconds = np.array([row.processor_s for row in records], dtype=np.float64)
     memory = np.array([row.peak_bytes or np.nan for row in records], dtype=np.float64)
-    time, peak = IterationCost.fitted(sizes[::2], seconds[::2]), IterationCost.fitted(sizes[::2], memory[::2])
+    time, peak = fitted_cost(sizes[::2], seconds[::2]), fitted_cost(sizes[::2], memory[::2])
     print(f"{'pixels':>9}{'visible':>9}{'all':>9}{'ms':>8}{'model':>8}{'plan':>8}{'MiB':>8}{'model':>8}")
     for row, (size, before, took, held) in enumerate(zip(sizes, in_plan, seconds, memory, strict=True)):
-        values = 1e3 * took, 1e3 * time.of(*size), 1e3 * time.of(*before)
+        values = 1e3 * took, 1e3 * time.of(work_of(size)), 1e3 * time.of(work_of(before))
         print(
             "".join(f"{value:9.0f}" for value in size)
             + "".join(f"{value:8.1f}" for value in values)
-            + f"{held / 2**20:8.0f}{peak.of(*size) / 2**20:8.0f}"
+            + f"{held / 2**20:8.0f}{peak.of(work_of(size)) / 2**20:8.0f}"
             + ("  held out" if row % 2 else "")
         )
     for what, predicted, truth in (
-        ("time by measured sizes", [time.of(*size) for size in sizes], seconds),
-        ("time by the plan's sizes", [time.of(*size) for size in in_plan], seconds),
-        ("memory", [peak.of(*size) for size in sizes], memory),
+        ("time by measured sizes", [time.of(work_of(size)) for size in sizes], seconds),
+        ("time by the plan's sizes", [time.of(work_of(size)) for size in in_plan], seconds),
+        ("memory", [peak.of(work_of(size)) for size in sizes], memory),
     ):
         error = np.abs(np.array(predicted) / truth - 1)[1::2]
         print(f"{what}, held out: median {100 * np.median(error):.0f} %, largest {100 * error.max():.0f} %")
-    print("seconds", IterationCost.fitted(sizes, seconds).coefficients.tolist())
-    print("bytes", IterationCost.fitted(sizes, memory).coefficients.tolist())
+    print("seconds", fitted_cost(sizes, seconds))
+    print("bytes", fitted_cost(sizes, memory))
 
 
 if __name__ == "__main__":

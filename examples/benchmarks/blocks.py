@@ -27,12 +27,11 @@ from pipelines.core.products import load_json
 from pipelines.core.stages import BLOCK_RECORD, REPORT
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.surface.surface_views import ModelRenderer
+from pipelines.surface.surface_views import model_renderer
 from pipelines.survey.block_plan import BlockCell, BlockRecord
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.report import read_report
-from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import load_trained
+from pipelines.survey.solution import read_sfm, read_trained
 
 # Half the width of the bands along the seams, relative to the square root of a cell's mean area.
 _BAND = 0.05
@@ -68,11 +67,12 @@ def near_seams(points: FloatArray, cells: Sequence[BlockCell], half_width_m: flo
 def squared_errors(place: Path, record: BlockRecord, half_width_m: float) -> dict[str, list[float]]:
     """Return the mean squared error of each test view: of the whole view, and of the band along the seams."""
     workspace = Workspace(place)
-    trained = load_trained(workspace)
-    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-    renderer = ModelRenderer(trained, images, rasterizer("auto"))
+    model = read_trained(workspace)
+    sfm, survey = read_sfm(workspace, model), load_survey(workspace)
+    renderer = model_renderer(workspace, model, sfm, survey)
+    images = renderer.images
     errors: dict[str, list[float]] = {"whole": [], "band": []}
-    for index in trained.indices("test"):
+    for index in model.indices("test"):
         render = renderer.render(index).colour.clamp(0, 1).cpu()
         photo = torch.from_numpy(np.array(images.image(index))).float() / 255.0
         error = (render - photo).square().mean(dim=-1).numpy()
@@ -110,8 +110,9 @@ def measured(place: Path, record: BlockRecord, half_width_m: float) -> dict[str,
 
 def cell_side(place: Path) -> float:
     """Return the square root of the mean area of a cell, in metres, from the extent of the SfM points."""
-    trained = load_trained(Workspace(place))
-    low, high = np.quantile(trained.point_in_model[:, :2], [0.01, 0.99], axis=0)
+    model = read_trained(Workspace(place))
+    points = model.point_in_model(read_sfm(Workspace(place), model))
+    low, high = np.quantile(points[:, :2], [0.01, 0.99], axis=0)
     record = load_json(BlockRecord, place / BLOCK_RECORD)
     return float(np.sqrt(np.prod(high - low) / len(record.blocks)))
 
@@ -134,11 +135,11 @@ def main() -> None:
     one, divided = (copied(args.workspace, args.scratch / name, cache) for name in ("one", "blocks"))
     threads = () if args.threads is None else ("--threads", args.threads)
     size = ("--max-gaussians", args.gaussians, "--max-image-size", args.image_size, *args.more, *threads)
-    plan = georef("blocks", "plan", divided, "--blocks", args.blocks, *size)
+    plan = georef("train", divided, "--part", "plan", "--blocks", args.blocks, *size)
     looks = np.mean([len(block["cameras"]) for block in plan["blocks"]]) / plan["photographs"]
     of_block = args.block_iterations or round(args.iterations * looks)
     georef("train", one, "--iterations", args.iterations, "--blocks", 1, *size)
-    georef("blocks", divided, "--iterations", of_block, "--blocks", args.blocks, *size)
+    georef("train", divided, "--iterations", of_block, "--blocks", args.blocks, *size)
     for place in (one, divided):
         georef("evaluate", place, *threads)
     record, half_width_m = load_json(BlockRecord, divided / BLOCK_RECORD), _BAND * cell_side(divided)

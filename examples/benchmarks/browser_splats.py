@@ -23,10 +23,9 @@ from pipelines.deliver.splat import codec_arrays
 from pipelines.formats.spz import write_spz
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians, transformed
-from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import load_trained
+from pipelines.surface.surface_views import model_renderer
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.view.pictures import Painter, Photographs, ViewerCamera, Wanted, frame_of
 from tests.browser.chromium import chromium, served
 
@@ -105,9 +104,11 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=3)
     args = parser.parse_args()
     workspace = Workspace(args.workspace)
-    trained = load_trained(workspace)
-    frame = frame_of(trained)
-    gaussians: Gaussians = trained.gaussians
+    model = read_trained(workspace)
+    sfm, survey = read_sfm(workspace, model), load_survey(workspace)
+    renderer = model_renderer(workspace, model, sfm, survey, backend="cpu")
+    frame = frame_of(model, sfm)
+    gaussians: Gaussians = renderer.gaussians
     if args.gaussians > len(gaussians):
         gaussians = split(gaussians, args.gaussians)
     first = pages_camera(frame)
@@ -129,13 +130,8 @@ def main() -> None:
             print(
                 f"a picture by the browser: median {np.median(times) / 1000:.2f} s; load {os.getloadavg()[0]:.1f}"
             )
-    if gaussians is trained.gaussians:
-        images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-        backend = rasterizer("cpu")
-        painter = Painter(
-            lambda whole: ModelRenderer(whole, images, backend),
-            Photographs(workspace, trained), trained, frame, None,
-        )  # fmt: skip
+    if gaussians is renderer.gaussians:
+        painter = Painter(renderer, Photographs(workspace, survey, renderer.sparse), frame, None)
         ours = painter.paint(camera, Wanted()).rgb / 255.0
         print(f"PSNR against the viewer's picture: {-10 * np.log10(np.mean((shown - ours) ** 2)):.1f} dB")
 

@@ -17,7 +17,7 @@ same marks; the last line is the error on the rendered surface, of the report. A
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,18 +27,18 @@ import torch
 from pipelines.core.stages import MEASURABLE_SPLAT, REPORT, SPLAT
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.placement import place
+from pipelines.deliver.placement import solved_placement
 from pipelines.geometry.cameras import Pinhole, pose_matrix
 from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.rasterizer.api import ALPHA_MAX, ALPHA_MIN, RasterSettings
-from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.rasterizer.reference import project_gaussians
 from pipelines.surface.picking import depth_around
-from pipelines.surface.surface_views import ModelRenderer
+from pipelines.surface.surface_views import ModelRenderer, model_renderer
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import MarkRays, mark_rays
 from pipelines.survey.report import read_report
-from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import TrainedSurvey, load_trained
+from pipelines.survey.solution import read_sfm, read_trained
+from pipelines.survey.survey import SurveyedPoint
 
 LEAST_OPACITY = 0.5
 NOT_HIDDEN = 1.01  # of the depth of the frontmost centre
@@ -97,22 +97,24 @@ def render(look: Look) -> int | None:
 
 
 def picked_errors_m(
-    trained: TrainedSurvey,
+    points: Sequence[SurveyedPoint],
+    renderer: ModelRenderer,
     gaussians: Gaussians,
     rules: list[Callable[[Look], int | None]],
+    *,
     reach_px: float,
     coarser: float,
 ) -> FloatArray:
     """Return errors (rules, K, 3) in depth, horizontally and vertically at all K marks; NaN: nothing is picked."""
-    rays, points = mark_rays(trained.survey.check_points, trained.sparse), trained.survey.check_points
+    rays, poses = mark_rays(points, renderer.sparse), renderer.poses
     true_in_geo = np.array([point.position_in_geo for point in points])[rays.point]
-    centres, geo_from_model = gaussians.means.numpy().astype(np.float64), trained.geo_from_model
+    centres, geo_from_model = gaussians.means.numpy().astype(np.float64), renderer.geo_from_model
     opaque = torch.sigmoid(gaussians.logit_opacities).numpy() >= LEAST_OPACITY
     errors = np.full((len(rules), len(rays.point), 3), np.nan)
     for camera in np.unique(rays.camera):
-        turn, center = trained.poses.cam_from_model[camera], trained.poses.cam_center_in_model[camera]
+        turn, center = poses.cam_from_model[camera], poses.cam_center_in_model[camera]
         in_cam = (centres - center) @ turn.T
-        focal_px = trained.sparse.camera_of(int(camera)).mean_focal_px
+        focal_px = renderer.sparse.camera_of(int(camera)).mean_focal_px
         window_px = focal_px / coarser
         pinhole = Pinhole(1, 1, window_px, window_px, 0.0, 0.0)
         for mark in np.flatnonzero(rays.camera == camera):
@@ -132,19 +134,18 @@ def picked_errors_m(
     return errors
 
 
-def surface_errors_m(trained: TrainedSurvey, rays: MarkRays, workspace: Workspace) -> FloatArray:
+def surface_errors_m(points: Sequence[SurveyedPoint], renderer: ModelRenderer, rays: MarkRays) -> FloatArray:
     """Return the errors (K,) in depth of the trained model's rendered surface at the marks; NaN: no surface."""
-    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-    images.build()
-    renderer, poses = ModelRenderer(trained, images, rasterizer("auto")), trained.poses
-    true_in_geo = np.array([point.position_in_geo for point in trained.survey.check_points])[rays.point]
-    true_in_model = trained.geo_from_model.inverse().apply(true_in_geo)
+    renderer.images.build()
+    poses = renderer.poses
+    true_in_geo = np.array([point.position_in_geo for point in points])[rays.point]
+    true_in_model = renderer.geo_from_model.inverse().apply(true_in_geo)
     errors = np.full(len(rays.point), np.nan)
     for mark, (camera, xy) in enumerate(zip(rays.camera, rays.xy, strict=True)):
         depth_m = depth_around(renderer, int(camera), xy).depth_at(xy)
         true_m = (poses.cam_from_model[camera] @ (true_in_model[mark] - poses.cam_center_in_model[camera]))[2]
         if depth_m > 0:
-            errors[mark] = trained.geo_from_model.scale * abs(depth_m - true_m)
+            errors[mark] = renderer.geo_from_model.scale * abs(depth_m - true_m)
     return errors
 
 
@@ -159,19 +160,23 @@ def main() -> None:
     parser.add_argument("--measurable", action="store_true", help="pick in the measurable splat")
     arguments = parser.parse_args()
     workspace = Workspace(arguments.workspace)
-    trained = load_trained(workspace)
-    placement = place(trained.model, trained.survey, trained.gaussians.means.numpy(), None)
+    model = read_trained(workspace)
+    sfm, survey = read_sfm(workspace, model), load_survey(workspace)
+    renderer = model_renderer(workspace, model, sfm, survey)
+    placement = solved_placement(model, survey, renderer.gaussians.means.numpy(), None)
     path = workspace.path(MEASURABLE_SPLAT if arguments.measurable else SPLAT)
     splat = transformed(read_gaussians(path), placement.file_from_model.inverse())
     rules: list[Callable[[Look], int | None]] = [front, nearest, render]
     print(f"{len(splat)} Gaussians\n{'':8}  marks  depth      H      V  (medians, m)")
-    picked_m = picked_errors_m(trained, splat, rules, arguments.reach, arguments.coarser)
+    picked_m = picked_errors_m(
+        survey.check_points, renderer, splat, rules, reach_px=arguments.reach, coarser=arguments.coarser
+    )
     for rule, errors in zip(rules, picked_m, strict=True):
         known = np.isfinite(errors[:, 0])
         depth_m, horizontal_m, vertical_m = np.median(errors[known], axis=0)
         print(f"{rule.__name__:8}  {known.sum():5}  {depth_m:.3f}  {horizontal_m:.3f}  {vertical_m:.3f}")
-    rays = mark_rays(trained.survey.check_points, trained.sparse)
-    surface_m = surface_errors_m(trained, rays, workspace)
+    rays = mark_rays(survey.check_points, renderer.sparse)
+    surface_m = surface_errors_m(survey.check_points, renderer, rays)
     print(f"surface   {np.isfinite(surface_m).sum():5}  {np.nanmedian(surface_m):.3f}")
     on_surface = read_report(workspace.path(REPORT)).checkpoints.surface
     assert on_surface is not None

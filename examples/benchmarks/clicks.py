@@ -29,12 +29,11 @@ from pipelines.geodesy.enu import ecef_from_enu, enu_from_ecef
 from pipelines.simulate.mesh import MISS, Material, Raycaster
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import fly_survey
-from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.picking import Sight, SurfacePoint
-from pipelines.surface.surface_views import ModelRenderer
+from pipelines.surface.surface_views import model_renderer
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.options import CrsOptions
-from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import load_trained
+from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.view.measuring import Fineness, MeasuringModel, WantedBase
 from pipelines.view.quantities import rim_base
 
@@ -48,9 +47,9 @@ _HIDDEN_M = 1.0  # a corner that is read further off is hidden by something else
 
 def sights(model: MeasuringModel, count: int) -> list[Sight]:
     """Return lines of sight from places near the cameras to places within the scene."""
-    trained, rng = model.trained, np.random.default_rng(0)
-    centers = trained.poses.cam_center_in_model
-    low, high = np.quantile(trained.point_in_model, [0.1, 0.9], axis=0)
+    renderer, rng = model.reader.renderer, np.random.default_rng(0)
+    centers = renderer.poses.cam_center_in_model
+    low, high = np.quantile(model.solution.point_in_model(renderer.sfm), [0.1, 0.9], axis=0)
     lines = []
     for _ in range(count):
         start = centers[rng.integers(len(centers))] + rng.normal(0, _SCATTER_M, 3)
@@ -61,11 +60,12 @@ def sights(model: MeasuringModel, count: int) -> list[Sight]:
 
 def compare_quantities(model: MeasuringModel, count: int, true_up: Callable[[FloatArray], FloatArray]) -> None:
     """Print error/σ of areas, volumes and profiles, pooled; `true_up` returns true heights (N,) at plans (N, 2)."""
-    trained, rng = model.trained, np.random.default_rng(1)
-    low, high = np.quantile(trained.geo_from_model.apply(trained.point_in_model)[:, :2], [0.2, 0.8], axis=0)
-    model_from_geo = trained.geo_from_model.inverse()
+    renderer, rng = model.reader.renderer, np.random.default_rng(1)
+    tie_points = renderer.geo_from_model.apply(model.solution.point_in_model(renderer.sfm))
+    low, high = np.quantile(tie_points[:, :2], [0.2, 0.8], axis=0)
+    model_from_geo = renderer.geo_from_model.inverse()
     ratios: dict[str, list[float]] = {"area": [], "volume": [], "profile": []}
-    centers = trained.poses.cam_center_in_model
+    centers = renderer.poses.cam_center_in_model
     tried = 0
     while len(ratios["volume"]) < count and tried < 20 * count:
         tried += 1
@@ -117,22 +117,23 @@ def main() -> None:
     parser.add_argument("--outlines", type=int, default=30)
     args = parser.parse_args()
     workspace = Workspace(args.workspace)
-    trained = load_trained(workspace)
-    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-    model = MeasuringModel(workspace, ModelRenderer(trained, images, rasterizer("cpu")), CrsOptions())
+    solution, survey = read_trained(workspace), load_survey(workspace)
+    sfm = read_sfm(workspace, solution)
+    renderer = model_renderer(workspace, solution, sfm, survey, backend="cpu")
+    model = MeasuringModel(workspace, survey, renderer, CrsOptions())
     world = fly_survey(SimulateOptions.model_validate({name: getattr(args, name) for name in _NAMES})).world
     mesh = world.scene.mesh
     rays = Raycaster(mesh)
 
     def in_world(point_in_geo: FloatArray) -> FloatArray:
-        return enu_from_ecef(ecef_from_enu(point_in_geo, trained.survey.origin_on_earth), world.origin)
+        return enu_from_ecef(ecef_from_enu(point_in_geo, survey.origin_on_earth), world.origin)
 
     rows = []
     for sight in sights(model, args.clicks):
         point = model.reader.under(sight)
         if not isinstance(point, SurfacePoint):
             continue
-        start = in_world(trained.geo_from_model.apply(sight.start_in_model[None]))
+        start = in_world(renderer.geo_from_model.apply(sight.start_in_model[None]))
         line = in_world(point.position_in_geo[None]) - start
         distance = float(np.linalg.norm(line))
         hit = rays.first_hits(start, line / distance)

@@ -22,9 +22,10 @@ from pipelines.splat.memory import predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache, Photograph
-from pipelines.train.adjusted_scene import AdjustedScene
+from pipelines.survey.scene import Scene, load_adjusted_scene
+from pipelines.survey.solution import Solution
 from pipelines.train.estimate import training_size
-from pipelines.train.geographic.problem import frozen_problem
+from pipelines.train.georeference.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.surface import SceneSurface
@@ -33,12 +34,12 @@ from pipelines.train.trainer import make_trainer
 
 def enlarged(
     workspace: Workspace, scratch: Path, count: int, size_px: int
-) -> tuple[AdjustedScene, list[Photograph]]:
-    """Scene of the first training photographs, enlarged to a longer side, under SfM's lens, and their files."""
-    whole = AdjustedScene.load(workspace)
-    adjusted = whole.of_images(whole.scene.train[:count])
-    scene, adjustment = adjusted.scene, adjusted.adjustment.model_copy(update={"lenses": ()})
-    folder = photograph_folder(workspace, adjusted.survey.image_dir)
+) -> tuple[Solution, Scene, list[Photograph]]:
+    """Solution and scene of the first training photographs, enlarged, under SfM's lens, and their files."""
+    solution, survey, whole = load_adjusted_scene(workspace)
+    first = whole.train[:count]
+    scene, solution = whole.of_images(first), solution.of_images(first).model_copy(update={"lenses": ()})
+    folder = photograph_folder(workspace, survey.image_dir)
     cameras = {}
     for key, camera in scene.sparse.cameras.items():
         factor = size_px / max(camera.width, camera.height)
@@ -53,7 +54,7 @@ def enlarged(
         with ProcessPoolExecutor(1) as pool:  # its memory does not count
             pool.submit(write_enlarged, folder / name, file, (camera.width, camera.height)).result()
         shots.append(Photograph(name, file, camera))
-    return replace(adjusted, scene=replace(scene, sparse=sparse), adjustment=adjustment), shots
+    return solution, replace(scene, sparse=sparse), shots
 
 
 def write_enlarged(source: Path, file: Path, size: tuple[int, int]) -> None:
@@ -79,7 +80,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=40)
     arguments = parser.parse_args()
     arguments.scratch.mkdir(parents=True)
-    adjusted, shots = enlarged(
+    solution, scene, shots = enlarged(
         Workspace(arguments.workspace), arguments.scratch, arguments.photographs, arguments.size
     )
     options = TrainOptions(
@@ -88,18 +89,18 @@ def main() -> None:
         crop_size=arguments.crop_size,
         max_gaussians=arguments.max_gaussians,
         coarse_to_fine=False,
-        optimize_cameras=False,
+        georeference="frozen",
     )
     backend, images = rasterizer(options.backend), ImageCache(arguments.scratch / "cache", shots, arguments.size)
     size = training_size(options, len(images), images.largest())
     before = peak_mib()
     images.build()
     print(f"undistorted: peak {peak_mib() - before:.0f} MiB more", flush=True)
-    maps = DepthMaps(arguments.scratch / "surface", adjusted.scene, images)
+    maps = DepthMaps(arguments.scratch / "surface", scene, images)
     maps.build()
     print(f"depth maps: peak {peak_mib() - before:.0f} MiB more", flush=True)
-    training = TrainingScene(adjusted.scene, images, SceneSurface(maps))
-    trainer = make_trainer(training, frozen_problem(adjusted), backend, options)
+    training = TrainingScene(scene, images, SceneSurface(maps))
+    trainer = make_trainer(training, frozen_problem(solution, scene), backend, options)
     print(f"initial: peak {peak_mib() - before:.0f} MiB more", flush=True)
     trainer.step()
     print(f"first iteration: peak {peak_mib() - before:.0f} MiB more", flush=True)

@@ -44,15 +44,14 @@ from pipelines.simulate.mesh import MISS, Material, Raycaster
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import RecordedFlight, fly_survey, write_lidar_flight
 from pipelines.simulate.truth import Truth
-from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.measured_cloud import CloudReader
-from pipelines.surface.surface_views import ModelRenderer
+from pipelines.surface.surface_views import model_renderer
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.report import read_report
-from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import load_trained
-from pipelines.train.adjusted_scene import AdjustedScene
+from pipelines.survey.scene import load_adjusted_scene, photographs
+from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.train.lidar import compared_lidar, lidar_surface, registration_of
 from pipelines.train.options import TrainOptions
 from pipelines.train.stage import measured_files
@@ -224,8 +223,7 @@ def comparison(
     manifest = workspace.manifest(BY_NAME["train"])
     assert manifest is not None
     options = TrainOptions.model_validate(manifest.config)
-    adjusted = AdjustedScene.load(workspace)
-    survey, scene = adjusted.survey, adjusted.scene
+    solution, survey, scene = load_adjusted_scene(workspace)
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     images.build(SILENT)
     maps, files = DepthMaps(workspace.cache / "surface", scene, images), measured_files(options, scene)
@@ -233,7 +231,7 @@ def comparison(
     maps.build(SILENT)
     compared = compared_lidar(
         options, files, maps, survey,
-        track=None, georeference=adjusted.adjustment.geo_from_model, seed=options.seed, progress=SILENT,
+        track=None, georeference=solution.geo_from_model, seed=options.seed, progress=SILENT,
     )  # fmt: skip
     if not changed:
         found = compared.registration.shift_m
@@ -264,14 +262,14 @@ def surface_errors(
 
     The last array (K,) says which pixels are of test views.
     """
-    covered, trained = points_of(cloud, flight), load_trained(workspace)
-    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-    renderer = ModelRenderer(trained, images, rasterizer("auto"))
+    covered, model = points_of(cloud, flight), read_trained(workspace)
+    sfm, survey = read_sfm(workspace, model), load_survey(workspace)
+    renderer = model_renderer(workspace, model, sfm, survey)
     mesh, origin = flight.world.scene.mesh, flight.world.origin
     rays = Raycaster(mesh)
     distances, materials, tests = [], [], []
     shown: dict[str, list[int]] = {"test": [], "train": []}
-    for index, camera in enumerate(trained.model.cameras):
+    for index, camera in enumerate(model.cameras):
         shown[camera.split].append(index)
     for index in [*shown["test"], *shown["train"][::EVERY]]:
         pose = renderer.pose(index)
@@ -281,8 +279,8 @@ def surface_errors(
         ray = pose.pinhole.rays(pixel) @ pose.cam_from_model
         place = pose.center_in_model + depth[row, column, None] * ray
         in_model = np.concatenate([pose.center_in_model[None], place])
-        in_geo = trained.geo_from_model.apply(in_model)
-        true_frame = enu_from_ecef(ecef_from_enu(in_geo, trained.survey.origin_on_earth), origin)
+        in_geo = model.similarity.apply(in_model)
+        true_frame = enu_from_ecef(ecef_from_enu(in_geo, survey.origin_on_earth), origin)
         center, place = true_frame[0], true_frame[1:]
         direction = (place - center) / np.linalg.norm(place - center, axis=1, keepdims=True)
         hits = rays.first_hits(center, direction)

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import diags
 
-from pipelines.adjust.posterior import camera_covariances, intersection_jacobian
+from pipelines.adjust.posterior import camera_covariances
 from pipelines.adjust.state import State, SystematicError, SystematicErrors
 from pipelines.adjust.system import Problem, linearised, minimise, posterior_weights
 from pipelines.adjust.terms import ControlPoints, Fixes
@@ -27,6 +27,7 @@ from pipelines.core.machine import peak_memory_bytes
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geometry.bundle import BundleInformation, bundle_information
 from pipelines.geometry.cameras import Camera, CameraPoses, Lenses, bearings, project_each
+from pipelines.geometry.intersection import intersection_jacobian
 from pipelines.geometry.network import Network
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import perturbation
@@ -150,7 +151,7 @@ def marks_of(seen: Network, truth: tuple[FloatArray, FloatArray], rng: np.random
         np.full(len(xy_px), _MARK_PX / _LENS.params[0]),
         Lenses(seen.cameras, seen.camera_id).bearing_jacobian(seen.obs_image, xy_px),
         true + rng.normal(0, _SURVEY_M, true.shape),
-        np.linalg.inv(np.linalg.cholesky(cov)),
+        cov,
     )
 
 
@@ -168,7 +169,7 @@ def problem_of(
         tuple(map(str, range(count))),
         np.arange(count),
         position,
-        np.tile(np.diag(1 / _RTK_M), (count, 1, 1)),
+        np.tile(np.diag(_RTK_M**2), (count, 1, 1)),
         np.zeros(count, dtype=np.int64),
     )
     errors = SystematicErrors((SystematicError("bias", _COMMON_M, 0),))

@@ -20,11 +20,10 @@ from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import ViewPose
 from pipelines.splat.exposure import with_affine
 from pipelines.splat.metrics import psnr
-from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.photometry import photograph_and_mask
-from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import load_trained
+from pipelines.surface.surface_views import model_renderer
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.solution import read_sfm, read_trained
 
 _SHRINKS = (1, 2, 4, 8)
 
@@ -52,14 +51,13 @@ def main() -> None:
 
 def _zoomed_out(workspace: Workspace) -> tuple[int, dict[int, float]]:
     """Return the number of Gaussians, and the mean PSNR of the test views by how much they are shrunken."""
-    trained = load_trained(workspace)
-    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-    backend = rasterizer("auto", mip_filter=trained.model.mip_filter)
-    renderer = ModelRenderer(trained, images, backend)
+    model = read_trained(workspace)
+    sfm, survey = read_sfm(workspace, model), load_survey(workspace)
+    renderer = model_renderer(workspace, model, sfm, survey)
     figures: dict[int, list[float]] = {shrink: [] for shrink in _SHRINKS}
-    for index in trained.indices("test"):
+    for index in model.indices("test"):
         photo, mask = photograph_and_mask(renderer, index)
-        pose, exposure = renderer.pose(index), trained.model.cameras[index].exposure
+        pose, exposure = renderer.pose(index), model.cameras[index].exposure
         for shrink, found in figures.items():
             small = pose.pinhole.limited(max(pose.pinhole.width, pose.pinhole.height) // shrink)
             size = small.width, small.height
@@ -68,7 +66,7 @@ def _zoomed_out(workspace: Workspace) -> tuple[int, dict[int, float]]:
             colour = renderer.render(ViewPose(small, pose.cam_from_model, pose.center_in_model)).colour.cpu()
             colour = colour if exposure is None else with_affine(colour, torch.tensor(exposure))
             found.append(psnr(colour, shown, torch.from_numpy(counts)))
-    return len(trained.gaussians), {shrink: float(np.mean(found)) for shrink, found in figures.items()}
+    return len(renderer.gaussians), {shrink: float(np.mean(found)) for shrink, found in figures.items()}
 
 
 if __name__ == "__main__":

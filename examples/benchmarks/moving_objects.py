@@ -15,12 +15,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from training import ViewQuality, scene_of, trainer_on
+from training import ViewQuality, trainer_on, undistorted
 
 from pipelines.core.types import BoolArray, ByteArray
+from pipelines.core.workspace import Workspace
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.survey.photographs import ImageCache, save_array
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import Scene, load_adjusted_scene
 from pipelines.train.options import TrainOptions
 from pipelines.train.trainer import JointTrainer
 
@@ -55,7 +56,7 @@ def psnr_at(trainer: JointTrainer, painted: dict[int, tuple[BoolArray, ByteArray
     """PSNR of all painted pixels together, with the exposures of the photographs."""
     squares = []
     for index, (mask, clean) in painted.items():
-        pose = trainer.problem.cameras.cam_from_model(index)
+        pose = trainer.problem.unknowns.cam_from_model(index)
         settings = RasterSettings(sh_degree=trainer.options.sh_degree)
         colour = trainer.rasterizer.render(
             trainer.optimizer.gaussians, pose, trainer.pinholes.of(index), settings
@@ -91,8 +92,9 @@ def main() -> None:
                 seed=arguments.seed,
             )
             if painted is None:
-                adjusted, images = scene_of(root, options)
-                painted = paint(adjusted.scene, images, arguments, write=objects)
+                _, survey, scene = load_adjusted_scene(Workspace(root))
+                images = undistorted(root, scene, survey, options)
+                painted = paint(scene, images, arguments, write=objects)
             trainer, scene, images = trainer_on(root, options)
             worked = time.process_time()
             for _ in range(arguments.iterations):

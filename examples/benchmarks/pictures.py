@@ -28,21 +28,25 @@ import torch
 from pipelines.core.stages import SPLAT
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.placement import place
+from pipelines.deliver.placement import solved_placement
 from pipelines.evaluate.photometric import TrainingCoverage
 from pipelines.geometry.cameras import pose_matrix
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.exposure import with_affine
 from pipelines.splat.gaussians import read_gaussians
 from pipelines.splat.metrics import psnr
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.surface.surface_views import ModelRenderer
+from pipelines.surface.surface_views import model_renderer
+from pipelines.survey.area import corners, scene_points
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.photographs import Pinholes
 from pipelines.survey.scene import photographs
+from pipelines.survey.solution import TrainedModel, read_sfm, read_trained
+from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import TargetCrs, target_crs
-from pipelines.survey.trained_survey import TrainedSurvey, corners, load_trained, scene_points
 
 PATCH_M, BROAD_M = 4.0, 1.3
 LEVEL_M = 1.0  # of the surface around a point from its height
@@ -81,17 +85,18 @@ class Opacity:
 
 def patches(workspace: Workspace) -> list[Patch]:
     """Return the detail around every control and check point on level ground inside of the orthophoto."""
-    trained = load_trained(workspace)
+    model = read_trained(workspace)
+    sfm, survey = read_sfm(workspace, model), load_survey(workspace)
     with rasterio.open(workspace.path(ORTHOPHOTO)) as raster:
         rgba, grid, crs = raster.read().astype(np.float64), raster.transform, raster.crs.to_string()
     with rasterio.open(workspace.path(DSM)) as raster:
         surface = raster.read(1)
-    around = corners(scene_points(trained))
-    target = target_crs(CrsOptions(crs=crs), trained.survey.origin, around, trained.survey.vertical)
-    photos = _Photographs(trained, workspace)
+    around = corners(scene_points(model, sfm))
+    target = target_crs(CrsOptions(crs=crs), survey.origin, around, survey.vertical)
+    photos = _Photographs(workspace, model, sfm, survey)
     half, broad = round(PATCH_M / 2 / grid.a), round(BROAD_M / grid.a) | 1
     found = []
-    for point in (*trained.survey.control_points, *trained.survey.check_points):
+    for point in (*survey.control_points, *survey.check_points):
         (east, north, height), *_ = target.xyz_from_geo(np.array([point.position_in_geo]))
         column, row = (int(cell) for cell in ~grid @ (east, north))
         reach = half + broad
@@ -142,10 +147,10 @@ def _detail(grey: FloatArray, broad: int, half: int) -> FloatArray:
 class _Photographs:
     """Training photographs at their full size, without lens and exposure."""
 
-    def __init__(self, trained: TrainedSurvey, workspace: Workspace) -> None:
-        largest = max(max(camera.width, camera.height) for camera in trained.sfm.cameras.values())
-        self._trained, self._images = trained, photographs(trained.sfm, trained.survey, workspace, largest)
-        self._pinholes = Pinholes(self._images, trained.sfm.lenses, trained.sparse.lenses)
+    def __init__(self, workspace: Workspace, model: TrainedModel, sfm: SparseModel, survey: Survey) -> None:
+        largest = max(max(camera.width, camera.height) for camera in sfm.cameras.values())
+        self._model, self._images = model, photographs(sfm, survey, workspace, largest)
+        self._pinholes = Pinholes(self._images, sfm.lenses, model.with_lenses(sfm).lenses)
 
     def steepest(
         self, place: FloatArray, cell_m: float, shape: tuple[int, int], hidden: Callable[[FloatArray], bool]
@@ -154,15 +159,16 @@ class _Photographs:
 
         A photograph that is finer than the cells is blurred by the difference.
         """
-        trained, best = self._trained, None
-        in_model, middle = trained.geo_from_model.inverse().apply(place), place.mean(axis=0)
-        for camera in trained.indices("train"):
-            center = trained.poses.cam_center_in_model[camera]
+        model, best = self._model, None
+        poses, geo_from_model = model.poses, model.similarity
+        in_model, middle = geo_from_model.inverse().apply(place), place.mean(axis=0)
+        for camera in model.indices("train"):
+            center = poses.cam_center_in_model[camera]
             pinhole = self._pinholes.of(camera)
-            pixel = pinhole.project((in_model - center) @ trained.poses.cam_from_model[camera].T)
+            pixel = pinhole.project((in_model - center) @ poses.cam_from_model[camera].T)
             if not pinhole.contains(pixel).all():
                 continue
-            center_in_geo = trained.geo_from_model.apply(center[None])[0]
+            center_in_geo = geo_from_model.apply(center[None])[0]
             arm = middle - center_in_geo
             distance_m = float(np.linalg.norm(arm))
             steep = float(-arm[2] / distance_m)
@@ -177,7 +183,7 @@ class _Photographs:
         if variance > 0.01:
             photo = cv2.GaussianBlur(photo, (0, 0), variance**0.5).astype(np.uint8)
         rgb = self._images.sampled(camera, photo, pixel.reshape(*shape, 2).astype(np.float32)).astype(np.float64)
-        exposure = trained.model.cameras[camera].exposure
+        exposure = model.cameras[camera].exposure
         if exposure is not None:
             gain, offset = np.split(np.array(exposure), [3], axis=1)
             rgb = (rgb - 255 * offset[:, 0]) @ np.linalg.inv(gain).T
@@ -214,16 +220,18 @@ def _within(cells: BoolArray, distance: int) -> BoolArray:
 
 def opacity(workspace: Workspace) -> Opacity:
     """Return how the splat looks over black and over white."""
-    trained, backend = load_trained(workspace), rasterizer("cpu")
-    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
+    model = read_trained(workspace)
+    sfm, survey = read_sfm(workspace, model), load_survey(workspace)
+    renderer = model_renderer(workspace, model, sfm, survey, backend="cpu")
+    images, poses = renderer.images, renderer.poses
     images.build()
-    renderer = ModelRenderer(trained, images, backend)
+    backend = rasterizer("cpu")  # of the written splat, which says itself how it was trained
     coverage = TrainingCoverage(renderer)
     headline = headline_of(workspace)
-    placed = place(trained.model, trained.survey, trained.gaussians.means.numpy(), headline).file_from_model
+    placed = solved_placement(model, survey, renderer.gaussians.means.numpy(), headline).file_from_model
     gaussians = read_gaussians(workspace.root / SPLAT)
     figures, alphas = [], []
-    for camera in trained.indices("test"):
+    for camera in model.indices("test"):
         photo = torch.from_numpy(np.array(images.image(camera))).float() / 255
         used = torch.from_numpy(np.array(images.mask(camera)))
         covered = coverage.covered(camera)
@@ -232,10 +240,10 @@ def opacity(workspace: Workspace) -> Opacity:
         middle = torch.zeros_like(used)
         middle[height // 6 : -(height // 6), width // 6 : -(width // 6)] = True
         used &= middle
-        rotation = trained.poses.cam_from_model[camera] @ placed.rotation.T
-        center = placed.apply(trained.poses.cam_center_in_model[camera][None])[0]
+        rotation = poses.cam_from_model[camera] @ placed.rotation.T
+        center = placed.apply(poses.cam_center_in_model[camera][None])[0]
         pose = torch.from_numpy(pose_matrix(rotation, center)).float()
-        exposure = trained.model.cameras[camera].exposure
+        exposure = model.cameras[camera].exposure
         with torch.no_grad():
             render = backend.render(gaussians, pose, renderer.pinholes.of(camera), RasterSettings())
         over = []

@@ -2,7 +2,7 @@
 
 Nothing is reconstructed or trained: surveys of photographs of 1600×1200 are made up, divided into blocks where one
 training does not fit, and the models of pipelines/jobs/costs.py are evaluated at their sizes, for processors only.
-Each cell says whether it is projected or was measured; docs/benchmarks.md, Large surveys, has the measured survey.
+Each cell says whether it is projected or was measured; results/scale.md has the measured survey.
 """
 
 from __future__ import annotations

@@ -28,6 +28,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from training import ViewQuality
 
+from pipelines.adjust.solution import posterior_of
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import PIPELINE, POINTS
 from pipelines.core.workspace import Workspace
@@ -37,12 +38,11 @@ from pipelines.jobs.machine import inspect_machine
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.adjustment import GeolocatedPoints
-from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import TrainedSurvey
-from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.geographic.problem import frozen_problem, refining_problem
+from pipelines.survey.scene import load_adjusted_scene, photographs
+from pipelines.train.georeference.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
+from pipelines.train.solution_state import measured_problem, solved_at
 from pipelines.train.stage import trained_model
 from pipelines.train.trainer import load_checkpoint, make_trainer
 
@@ -135,26 +135,28 @@ def measured(workspace: Workspace, age_s: dict[Path, float]) -> list[Row]:
     assert manifest is not None
     # Gaussians come from the checkpoints: the stereo that only places the first ones is not repeated.
     options = TrainOptions.model_validate({**manifest.config, "dense": False})
-    adjusted, backend = AdjustedScene.load(workspace), rasterizer(options.backend)
-    survey, scene = adjusted.survey, adjusted.scene
+    (started, survey, scene), backend = load_adjusted_scene(workspace), rasterizer(options.backend)
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
-    observed = adjusted.measured(control_points=options.gcp_loss)
+    observed = measured_problem(started, survey, scene, control_points=options.gcp_loss)
     refines, points = options.refined_cameras(len(images)) > 0, GeolocatedPoints.load(workspace.path(POINTS))
-    problem = (
-        refining_problem(adjusted, observed, options, points, options.seed) if refines else frozen_problem(adjusted)
-    )
+    problem = frozen_problem(started, scene)
+    if refines:
+        posterior = posterior_of(workspace, started, scene.sparse)
+        problem = refining_problem(posterior, survey, scene, observed, options, points=points, seed=options.seed)
     trainer = make_trainer(TrainingScene(scene, images), problem, backend, options)
     rows: list[Row] = []
     for path, seconds in age_s.items():
         trainer.restore(load_checkpoint(path))
         if trainer.iteration == 0 or (rows and rows[-1].iteration == trainer.iteration):
             continue  # the last one is written twice
-        solution = adjusted.posterior(observed, problem.state()).solution if refines else adjusted.adjustment
+        solution = started
+        if refines:
+            solution = solved_at(started, survey, scene, observed, problem.unknowns.state()).solution
         model = trained_model(trainer, solution)
-        trained = TrainedSurvey(survey, scene.sparse, model, trainer.optimizer.gaussians.detached())
-        renderer = ModelRenderer(trained, images, backend)
+        gaussians = trainer.optimizer.gaussians.detached()
+        renderer = ModelRenderer(model, scene.sparse, gaussians, images, backend)
         views = compare_test_views(renderer, None, lambda _name, _picture: None, SILENT, saved=0)
-        errors = check_points_on_surface(renderer, SILENT)
+        errors = check_points_on_surface(survey.check_points, renderer, SILENT)
         train_psnr = ViewQuality(trainer, images).psnr(scene.train)
         rows.append(
             Row(

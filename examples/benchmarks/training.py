@@ -3,7 +3,9 @@
 `scaling` prints time and memory of an iteration (projection, harmonics, binning, blending, loss with SSIM,
 backward, optimiser, density statistics) against Gaussians and pixels, over the made-up scene of raster.py. `curve`
 trains on a workspace with each strategy and limit of Gaussians, and prints PSNR of training views (exposures
-applied) and test views against time; the time that measuring takes does not count.
+applied) and test views against time; the time that measuring takes does not count. `georeference` trains with each
+way of holding to the georeference and several seeds, and prints test PSNR, errors of check points, and how far the
+cameras have moved from the adjustment.
 """
 
 from __future__ import annotations
@@ -24,12 +26,14 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import cv2
 import numpy as np
 import torch
+from fitted_cost import fitted_cost, work_of
 from raster import make_scene
 
+from pipelines.adjust.solution import posterior_of
+from pipelines.core.stages import POINTS
 from pipelines.core.types import IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Pinhole
-from pipelines.jobs.costs import IterationCost
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.losses import photometric_loss
 from pipelines.splat.memory import TrainingSize, predicted_peak_bytes
@@ -38,12 +42,15 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
+from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.marks import mark_rays, triangulated_points
 from pipelines.survey.photographs import ImageCache
-from pipelines.survey.scene import Scene, photographs
-from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.geographic.problem import refining_problem
+from pipelines.survey.scene import Scene, load_adjusted_scene, photographs
+from pipelines.survey.survey import Survey
+from pipelines.train.georeference.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
+from pipelines.train.solution_state import measured_problem, solved_at
 from pipelines.train.surface import SceneSurface
 from pipelines.train.trainer import JointTrainer, make_trainer
 
@@ -90,29 +97,33 @@ def scaling(arguments: argparse.Namespace) -> None:
     if len(sizes) < 4:
         return
     for name, measured in zip(("seconds", "processor seconds"), np.array(best).T, strict=True):
-        cost = IterationCost.fitted(np.array(sizes), measured)
-        ratio = np.array([cost.of(*one) for one in sizes]) / measured
-        print(f"{name}: {np.round(cost.coefficients, 4).tolist()}, {ratio.min():.2f} to {ratio.max():.2f} of each")
+        cost = fitted_cost(np.array(sizes), measured)
+        ratio = np.array([cost.of(work_of(size)) for size in np.array(sizes)]) / measured
+        print(f"{name}: {np.round(cost, 4).tolist()}, {ratio.min():.2f} to {ratio.max():.2f} of each")
 
 
-def scene_of(root: Path, options: TrainOptions) -> tuple[AdjustedScene, ImageCache]:
-    """Scene of a workspace with init-sim3 done, and its undistorted photographs."""
-    workspace = Workspace(root)
-    adjusted = AdjustedScene.load(workspace)
-    images = photographs(adjusted.scene.sparse, adjusted.survey, workspace, options.effort.max_image_size)
+def undistorted(root: Path, scene: Scene, survey: Survey, options: TrainOptions) -> ImageCache:
+    """Undistorted photographs of a workspace with init-sim3 done."""
+    images = photographs(scene.sparse, survey, Workspace(root), options.effort.max_image_size)
     images.build()
-    return adjusted, images
+    return images
 
 
 def trainer_on(root: Path, options: TrainOptions) -> tuple[JointTrainer, Scene, ImageCache]:
     """Trainer before its first iteration, on a workspace with init-sim3 done, as `georef train` makes it."""
-    adjusted, images = scene_of(root, options)
-    scene, measured = adjusted.scene, adjusted.measured(control_points=options.gcp_loss)
+    solution, survey, scene = load_adjusted_scene(Workspace(root))
+    images = undistorted(root, scene, survey, options)
+    measured = measured_problem(solution, survey, scene, control_points=options.gcp_loss)
     maps = DepthMaps(Workspace(root).cache / "surface", scene, images)
     maps.build()
+    problem = frozen_problem(solution, scene)
+    if options.refined_cameras(len(images)):
+        posterior = posterior_of(Workspace(root), solution, scene.sparse)
+        points = GeolocatedPoints.load(Workspace(root).path(POINTS))
+        problem = refining_problem(posterior, survey, scene, measured, options, points=points, seed=options.seed)
     trainer = make_trainer(
         TrainingScene(scene, images, SceneSurface(maps)),
-        refining_problem(adjusted, measured, options, seed=options.seed),
+        problem,
         rasterizer(options.backend),
         options,
     )
@@ -170,7 +181,7 @@ class ViewQuality:
 
     def _psnr(self, index: int) -> float:
         trainer, settings = self.trainer, RasterSettings(sh_degree=self.trainer.options.sh_degree)
-        pose, pinhole = trainer.problem.cameras.cam_from_model(index), trainer.pinholes.of(index)
+        pose, pinhole = trainer.problem.unknowns.cam_from_model(index), trainer.pinholes.of(index)
         colour = trainer.rasterizer.render(trainer.optimizer.gaussians, pose, pinhole, settings).colour
         if trainer.exposures is not None:
             colour = trainer.exposures.apply(index, colour)
@@ -181,6 +192,52 @@ class ViewQuality:
             pair = torch.cat([photo, colour], dim=1).mul(255).round().byte().numpy()
             cv2.imwrite(str(self.look / f"{index:04d}.png"), pair[..., ::-1])
         return psnr(colour, photo, torch.from_numpy(np.array(self.images.mask(index))))
+
+
+FIGURES = ("PSNR dB", "H mm", "V mm", "moved mm", "most mm", "whole mm", "surplus")
+
+
+def georeference(arguments: argparse.Namespace) -> None:
+    """Print figures of trainings that hold to the georeference in several ways: of each run, mean and spread."""
+    print(f"{'georeference':12s} seed    " + "  ".join(f"{name:>10s}" for name in FIGURES), flush=True)
+    found: dict[str, list[list[float]]] = {}
+    for seed, form in product(arguments.seeds, arguments.forms):
+        given = {"preset": "smoke", "iterations": arguments.iterations, "seed": seed, "georeference": form}
+        options = TrainOptions.model_validate({**given, "backend": arguments.backend})
+        trainer, scene, images = trainer_on(arguments.workspace, options)
+        while trainer.iteration < arguments.iterations:
+            trainer.step()
+        test = ViewQuality(trainer, images).psnr(scene.test)
+        found.setdefault(form, []).append([test, *placed(arguments.workspace, trainer, options)])
+        print(f"{form:12s} {seed:6d}  " + "  ".join(f"{one:10.3f}" for one in found[form][-1]), flush=True)
+    for form, runs in found.items():
+        for what, of_runs in (("mean", np.mean(runs, axis=0)), ("spread", np.std(runs, axis=0))):
+            print(f"{form:12s} {what:6s}  " + "  ".join(f"{one:10.3f}" for one in of_runs), flush=True)
+
+
+def placed(root: Path, trainer: JointTrainer, options: TrainOptions) -> list[float]:
+    """Return `FIGURES` after the first: check points, triangulated, motion of the cameras, χ² of the motion.
+
+    H and V are RMSE. The motion since `init-sim3`, in `geo`, is the root mean square over the cameras beside their
+    mean, the largest of all, and that mean. Its χ² is what it costs all measurements.
+    """
+    solution, survey, scene = load_adjusted_scene(Workspace(root))
+    model, unknowns = solution, trainer.problem.unknowns
+    if len(unknowns.w):
+        measured = measured_problem(solution, survey, scene, control_points=options.gcp_loss)
+        model = solved_at(solution, survey, scene, measured, unknowns.state()).solution
+    rays = mark_rays(survey.check_points, model.with_lenses(scene.sparse))
+    surveyed = np.array([point.position_in_geo for point in survey.check_points])
+    error = triangulated_points(model, rays) - surveyed
+    error = error[np.isfinite(error).all(axis=1)]
+    moved = model.center_in_geo - solution.center_in_geo
+    own = np.linalg.norm(moved - moved.mean(axis=0), axis=1)
+    lengths_m = (
+        *(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()), np.sqrt((error[:, 2] ** 2).mean())),
+        *(np.sqrt(np.mean(own**2)), np.linalg.norm(moved, axis=1).max(), np.linalg.norm(moved.mean(axis=0))),
+    )
+    surplus = float(unknowns.chi2().detach())
+    return [*(1e3 * float(length) for length in lengths_m), surplus]
 
 
 def now(device: str) -> float:
@@ -220,6 +277,12 @@ def main() -> None:
     time_line.add_argument("--look", type=Path, help="folder for photographs beside their renders")
     time_line.add_argument("--geometry-regularisation", action=argparse.BooleanOptionalAction, default=True)
     time_line.set_defaults(run=curve)
+    held = modes.add_parser("georeference", help="quality against what a training does with the georeference")
+    held.add_argument("workspace", type=Path, help="with init-sim3 done")
+    held.add_argument("--forms", nargs="+", default=["joint", "frozen"], help="of joint, paper, frozen")
+    held.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    held.add_argument("--iterations", type=int, default=200)
+    held.set_defaults(run=georeference)
     arguments = parser.parse_args()
     arguments.run(arguments)
 

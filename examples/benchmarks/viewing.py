@@ -112,7 +112,7 @@ def time_answers(viewer: Viewer, clicks: int) -> None:
     print(f"click: median {np.median(taken):.3f} s, slowest {np.max(taken):.3f} s")
     down = np.array([0.0, 0.0, -1.0])
     middle, half = viewer.frame.middle_in_geo, np.sqrt(1000.0) / 2
-    model_from_geo = viewer.trained.geo_from_model.inverse()
+    model_from_geo = viewer.solution.similarity.inverse()
     corners = []
     for x, y in ((-half, -half), (half, -half), (half, half), (-half, half)):
         start_at = middle + np.array([x, y, 2 * viewer.frame.radius_m])

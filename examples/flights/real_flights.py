@@ -20,7 +20,8 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Set
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -241,10 +242,16 @@ def measured(figures: Figures) -> str:
     return f"{100 * values['measured']:.0f} % of {values['area_ha']:.2f} ha" if values else "–"
 
 
-def remarks(figures: Figures) -> list[str]:
-    """Return the sentences of all warnings and cautions, each once."""
+def remarks(figures: Figures) -> dict[str, str]:
+    """Return the code of each warning and caution by its sentence."""
     notes = [note for manifest in figures.manifests.values() for note in (*manifest.warnings, *manifest.cautions)]
-    return list(dict.fromkeys(note.sentence for note in notes))
+    return {note.sentence: note.code for note in notes}
+
+
+def common_remarks(flights: list[dict[str, str]]) -> set[str]:
+    """Return the codes of the remarks that more than half of the flights have, of three or more."""
+    codes = Counter(code for texts in flights for code in set(texts.values()))
+    return {code for code, count in codes.items() if len(flights) > 2 and 2 * count > len(flights)}
 
 
 def page_of(
@@ -262,13 +269,16 @@ def page_of(
         )
     )
     table = [row_of(flight, run, arguments.out / flight.name) for flight, run in rows]
-    sections = [section(flight, run, arguments.out / flight.name, images) for flight, run in rows]
-    left = [f"- {f.title}: [{f.source.rsplit('/', 1)[-1]}]({f.source}), {f.licence}. {f.test}." for f in others]
-    return "\n".join([head.rstrip("\n"), *table, "", *sections, "## Not run", "", *left, ""])
+    common = common_remarks([remarks(figures_of(arguments.out / flight.name)) for flight, _ in rows])
+    shared = [f"Most of them have the remarks {codes_text(Counter(sorted(common)))}.", ""] if common else []
+    sections = [section(flight, run, arguments.out / flight.name, images, common) for flight, run in rows]
+    left = ", ".join(f"[{flight.title}]({flight.source})" for flight in others)
+    unrun = ["## Not run", "", f"{left}.", ""] if others else []
+    return "\n".join([head.rstrip("\n"), *table, "", *shared, *sections, *unrun])
 
 
-def section(flight: Flight, run: Run, workspace: Path, images: Path) -> str:
-    """Return what the page says of one flight."""
+def section(flight: Flight, run: Run, workspace: Path, images: Path, said: Set[str] = frozenset()) -> str:
+    """Return what the page says of one flight, without remarks whose codes are `said` elsewhere."""
     figures = figures_of(workspace)
     place = f"[{flight.source.removeprefix('https://github.com/')}]({flight.source})"
     place += f" at `{flight.commit[:12]}`" if flight.commit else ""
@@ -283,8 +293,14 @@ def section(flight: Flight, run: Run, workspace: Path, images: Path) -> str:
         lines += ["", f"![Orthophoto of {flight.title}](images/real_{flight.name}.jpg)"]
     if run.error:
         lines += ["", f"**Failed**: {plain(run.error)}"]
-    lines += ["", *(f"- {plain(text)}" for text in remarks(figures)), ""]
+    own = Counter(code for code in remarks(figures).values() if code not in said)
+    lines += ["", f"Remarks: {codes_text(own)}.", ""] if own else [""]
     return "\n".join(lines)
+
+
+def codes_text(codes: Counter[str]) -> str:
+    """Return the codes of remarks with how often each was said: the flight's report has the sentences."""
+    return ", ".join(f"`{code}`" + (f" ({count})" if count > 1 else "") for code, count in codes.items())
 
 
 def plain(text: str) -> str:

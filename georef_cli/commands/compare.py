@@ -44,8 +44,7 @@ command = Command(
         options.JSON,
     ],
     callback=click.pass_context(_compare),
-    help="""Run the ablation on one survey and put its figures into one table.
-
+    help="""
         baseline: bundle adjustment with the fixes, then 3DGS. A: 3DGS, aligned afterwards with the fixes. B: its
         Gaussians, placed by the paper's initial similarity. C: similarity and cameras trained too, with L_abs.
         D: C with L_gcp and L_rel. E: D with a rising weight, the full method.

@@ -11,8 +11,8 @@ import click
 from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.display import progress_for
-from georef_cli.layout import plain_table, shown
 from georef_cli.output import print_json, print_rich
+from georef_cli.tables import literal, plain_table
 
 if TYPE_CHECKING:
     from pipelines.core.extras import Part
@@ -38,49 +38,49 @@ def _doctor(ctx: click.Context, as_json: bool, compile_cuda: bool, fetch_weights
     table.columns[1].overflow = "fold"
     missing = learned_weights.missing_for_learned()
     weights = f"in {learned_weights.weights_folder()}" if missing is None else missing
-    for name, text in [*_lines(machine), ("learned features", shown(weights))]:
+    for name, text in [*_lines(machine), ("learned features", literal(weights))]:
         table.add_row(f"[bold]{name}[/]", text)
     print_rich(table)
 
 
 def _lines(machine: Machine) -> list[tuple[str, str]]:
     """Return the findings with their names; markup."""
-    gpus = [f"{shown(gpu.name)}, {_gib(gpu.bytes)}" for gpu in machine.gpus] or ["none that torch sees"]
+    gpus = [f"{literal(gpu.name)}, {_gib(gpu.bytes)}" for gpu in machine.gpus] or ["none that torch sees"]
     lines = [
-        ("system", shown(f"{machine.system}, Python {machine.python}")),
+        ("system", literal(f"{machine.system}, Python {machine.python}")),
         ("cores", f"{machine.cores}, of which {machine.threads} are used (-j)"),
         ("memory", f"{_gib(machine.memory_bytes)}, {_gib(machine.free_bytes)} of them free"),
         ("GPU", "; ".join(gpus)),
     ]
     for backend in machine.backends:
-        reason = shown(backend.reason)
+        reason = literal(backend.reason)
         if backend.name == "cuda":
             reason = "see below" if machine.gpus else "no GPU that torch sees; it needs one, and all below"
         state = "[green]available[/]" if backend.available else f"[yellow]no[/]: {reason}"
         lines.append((f"backend {backend.name}", state))
     lines += [(f"  {part.name}", _state(part)) for part in machine.cuda_parts]
     uncompiled = "not compiled yet: the first use compiles them, or `georef doctor --compile-cuda` now"
-    lines.append(("  kernels", shown(machine.cuda_kernels or uncompiled)))
+    lines.append(("  kernels", literal(machine.cuda_kernels or uncompiled)))
     grids = machine.grids[:_MOST_GRIDS]
     more = f" and {len(machine.grids) - len(grids)} more" if len(machine.grids) > len(grids) else ""
     none = (
         "[yellow]none[/]: heights above a geoid need its grid (pyproj sync --file NAME); ellipsoidal ones need none"
     )
     lines += [
-        ("PROJ grids", shown(", ".join(grids) + more) if grids else none),
-        ("in", shown(", ".join(machine.grid_folders))),
-        ("Chromium", shown(machine.chromium or "not found; `georef report --pdf` needs it")),
+        ("PROJ grids", literal(", ".join(grids) + more) if grids else none),
+        ("in", literal(", ".join(machine.grid_folders))),
+        ("Chromium", literal(machine.chromium or "not found; `georef report --pdf` needs it")),
     ]
     sizes = machine.sizes_mb
     lines += [(f"extra {part.name}", f"{_state(part)} ({sizes[part.name]} MB)") for part in machine.extras]
     lines.append(("extra cuda", f"see backend cuda ({sizes['cuda']} MB, with torch's build for CUDA)"))
     lines.append(("without extras", f"{sizes['core']} MB, with torch's build for the CPU"))
     versions = ", ".join(f"{name} {version}" for name, version in machine.versions.items())
-    return [*lines, ("versions", shown(versions))]
+    return [*lines, ("versions", literal(versions))]
 
 
 def _state(part: Part) -> str:
-    return f"[yellow]missing[/]: {shown(part.remedy)}" if part.found is None else shown(part.found)
+    return f"[yellow]missing[/]: {literal(part.remedy)}" if part.found is None else literal(part.found)
 
 
 def _gib(count: int | None) -> str:
@@ -104,10 +104,10 @@ command = Command(
         ),
     ],
     callback=_doctor,
-    help="""Show what this machine offers: cores, memory, GPU, backends, extras, geoid grids, versions.
-
-    A backend that cannot be used is named with the reason: for cuda, each part that it needs and how to get it.
-    Nothing is written, except the kernels and weights that --compile-cuda and --fetch-weights ask for.
+    help="""
+    Cores, extras and versions are shown, too. A backend that cannot be used is named with the reason: for cuda,
+    each part that it needs and how to get it. Nothing is written, except the kernels and weights that
+    --compile-cuda and --fetch-weights ask for.
 
     \b
     Examples:

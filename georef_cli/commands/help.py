@@ -56,8 +56,7 @@ command = Command(
     "help",
     params=[click.Argument(["topic"], required=False, type=TopicType(), metavar="[TOPIC]"), options.JSON],
     callback=click.pass_context(_help),
-    help="""Explain a topic or a command.
-
+    help="""
     Without a topic: the list of the topics.
 
     \b

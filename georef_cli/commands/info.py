@@ -24,10 +24,9 @@ command = Command(
     "info",
     params=[options.WORKSPACE, *options.stage_options(CrsOptions), options.JSON],
     callback=click.pass_context(_info),
-    help="""Show where on Earth the result is, how good it is, what was made and what each file is for.
-
-        The bounds hold 98 % of the Gaussians along each coordinate. With --json: a GeoJSON feature, the bounds as
-        its polygon. Nothing is written.
+    help="""
+        Its accuracy and what else can be made are stated, too. The bounds hold 98 % of the Gaussians along each
+        coordinate. With --json: a GeoJSON feature, the bounds as its polygon. Nothing is written.
 
         \b
         Examples:

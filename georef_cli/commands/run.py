@@ -11,11 +11,10 @@ import click
 
 from georef_cli import boundary, options
 from georef_cli.command import Command
-from georef_cli.display import is_told, progress_for
+from georef_cli.display import is_logged, progress_for
 from georef_cli.estimate import RunTimeLeft, announced_estimate, keep_times, print_dry_run
-from georef_cli.evaluation import evaluated_cameras
 from georef_cli.options import SET, settings
-from georef_cli.output import print_outcomes
+from georef_cli.output import evaluated_cameras, print_outcomes
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
 from pipelines.core.options import names_of_flags, remembered
@@ -39,13 +38,16 @@ log = logging.getLogger(__name__)
 _EFFORT = ("preset", "iterations", "max_image_size", "max_gaussians", "crop_size", "blocks")
 _LIDAR = (
     *("lidar", "lidar_crs", "lidar_vertical", "lidar_offset", "lidar_up"),
-    *("lidar_trajectory", "lidar_sigma", "lidar_register"),
+    *("lidar_trajectory", "lidar_sigma", "lidar_register", "lidar_held_out"),
     *("depth_unit", "depth_along", "depth_camera"),
 )
 _IN_AREA = (
     "train",
     "evaluate",
-    *(f"export-{name}" for name in ("ply", "measurable", "raster", "cloud", "mesh", "spz", "tiles", "html")),
+    *(
+        f"export-{name}"
+        for name in ("ply", "measurable", "raster", "cloud", "mesh", "spz", "sog", "tiles", "html", "opf")
+    ),
 )
 LATER: dict[str, tuple[str, ...]] = {
     "mapper": ("sfm",),
@@ -85,20 +87,20 @@ def _run(ctx: click.Context, **values: Any) -> None:
     forget, force = _forgotten(values["forget"], stages), values["force"]
     if stages[0].reads:
         must_exist(workspace)
-    asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
+    flags_by_stage = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
     if values["dry_run"]:
         print_dry_run(
             workspace,
             stages,
-            asked,
+            flags_by_stage,
             force=force,
             as_json=values["as_json"],
             progress=progress_for(ctx.obj),
             given=flags,
         )
         return
-    before, estimate = pace.ticks(), announced_estimate(workspace, stages, asked, force=force)
-    left = RunTimeLeft({} if estimate is None else estimate.seconds)
+    before, estimate = pace.ticks(), announced_estimate(workspace, stages, flags_by_stage, force=force)
+    time_left = RunTimeLeft({} if estimate is None else estimate.seconds)
     progress = progress_for(ctx.obj)
     # A program that follows several runs shows how many stages of each are done; bars and lines name the stages.
     with (progress if ctx.obj.json_progress else SILENT).task("stages", len(stages)) as done:
@@ -109,7 +111,7 @@ def _run(ctx: click.Context, **values: Any) -> None:
             forget=forget,
             force=force,
             progress=progress,
-            around=lambda spec: _counted(workspace, spec, done, left, trains=trains),
+            around=lambda spec: _counted(workspace, spec, done, time_left, trains=trains),
         )
     keep_times(estimate, outcomes, before)
     newest = with_newest_solution(workspace)
@@ -121,13 +123,13 @@ def _run(ctx: click.Context, **values: Any) -> None:
         solved,
         cautions=outdated(workspace, newest),
         as_json=values["as_json"],
-        told=is_told(ctx.obj),
+        logged=is_logged(ctx.obj),
     )
 
 
 @contextlib.contextmanager
 def _counted(
-    workspace: Workspace, spec: StageSpec, done: ProgressTask, left: RunTimeLeft, *, trains: bool
+    workspace: Workspace, spec: StageSpec, done: ProgressTask, time_left: RunTimeLeft, *, trains: bool
 ) -> Iterator[None]:
     """Log a stage to its file, say what time the run has left, and count the stage when it has ended."""
     if trains and spec.name == "sfm":  # which leaves time, and comes before the first use of the kernels
@@ -135,13 +137,13 @@ def _counted(
 
         start_compilation()
     with boundary.logged_to_file(workspace, spec):
-        if left.seconds:
-            log.info("run: about %s left", about(left.seconds))
-        done.advance(0, spec.name, left.seconds)
-        left.begin()
+        if time_left.seconds:
+            log.info("run: about %s left", about(time_left.seconds))
+        done.advance(0, spec.name, time_left.seconds)
+        time_left.begin()
         yield
-    left.end(spec.name)
-    done.advance(1, spec.name, left.seconds)
+    time_left.end(spec.name)
+    done.advance(1, spec.name, time_left.seconds)
 
 
 def _overview(workspace: Workspace) -> Overview | None:
@@ -246,8 +248,7 @@ command = Command(
     ],
     callback=click.pass_context(_run),
     sections=SECTIONS,
-    help="""Run all stages, or some, skipping what is current.
-
+    help="""
         What was interrupted is resumed. Options that a stage was given before are remembered, so that a later
         run needs only what changes: `georef status WS --options` shows them, --forget drops one. Options that are
         not listed here are given with --set, in WS/georef.toml, or with the stage's own command.

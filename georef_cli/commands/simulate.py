@@ -10,8 +10,8 @@ import click
 from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.display import progress_for
-from georef_cli.layout import shown
 from georef_cli.output import print_result
+from georef_cli.tables import literal
 from pipelines.core.options import CONFIG_FILE
 from pipelines.core.sentences import duration
 from pipelines.simulate.options import SimulateOptions
@@ -24,7 +24,7 @@ def _simulate(ctx: click.Context, **values: Any) -> None:
     started = time.monotonic()
     summary = simulate(survey_options, values["directory"], progress_for(ctx.obj), overwrite=values["force"])
     took = duration(time.monotonic() - started)
-    text = f"[bold]simulate[/]: {shown(f'{summary.key_figure} in {summary.directory} ({took})')}"
+    text = f"[bold]simulate[/]: {literal(f'{summary.key_figure} in {summary.directory} ({took})')}"
     document = {**dataclasses.asdict(summary), "directory": str(summary.directory)}
     print_result(document, text, as_json=values["as_json"])
 
@@ -38,8 +38,7 @@ command = Command(
         options.JSON,
     ],
     callback=click.pass_context(_simulate),
-    help="""Simulate a survey whose truth is known exactly.
-
+    help="""
         DIR gets photographs, a trajectory, raw navigation, control and check points in the form of a surveyor's
         files, and truth.json with the truth behind them. The same options give the same bytes.
 

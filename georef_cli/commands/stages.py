@@ -1,207 +1,245 @@
-"""Commands of the stages that need no more than their options: what `--help` says of each below its title."""
+"""Commands of the stages: title, text and flags come from the table of stages and the options; some do more."""
 
-from typing import Literal
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import click
+from rich.console import Group, RenderableType
+from rich.table import Table
 
-from georef_cli.command import Command
-from georef_cli.options import FOLDER, flag
+from georef_cli import boundary, options
+from georef_cli.commands.cluster import ENGINE, requested_engine
+from georef_cli.display import is_logged, progress_for
+from georef_cli.options import flag
+from georef_cli.output import print_json, print_outcome, print_rich
 from georef_cli.stage import StageCommand
+from georef_cli.tables import Renderable, coordinate_tables, error_tables, literal, plain_table
+from pipelines.core import stages
+from pipelines.core.options import StageOptions, remember
+from pipelines.core.products import load_json
+from pipelines.core.sentences import about
+from pipelines.core.staleness import Flags, must_exist, stage_config
+from pipelines.core.workspace import Workspace
+from pipelines.survey.report import read_report
+from pipelines.survey.survey import RigCalibration, Survey
 
-_HELP = {
-    "ingest": """
-    Positions come from the photographs' EXIF and XMP, or from a trajectory (CSV, RTKLIB, DJI, Metashape) or an ODM
-    geo.txt; or photographs and positions come from a ROS bag. Photographs in a folder are referenced where they
-    are, unless --copy. Check points never enter any solve. Points without marks are listed for marking later.
-
-    \b
-    Examples:
-      georef ingest flight --images photos
-      georef ingest flight --images photos --gcp gcp_list.txt --check P7 --check P9
-      georef ingest flight --images photos --trajectory track.csv --crs EPSG:32632 --vertical EGM2008
-      georef ingest flight --images photos --trajectory flight_Timestamp.MRK --gcp markers.xml
-      georef ingest flight --images photos --gcp gcps.csv --gcp-crs EPSG:2056+5728 --marks marks.csv
-      georef ingest flight --bag flight_bag --every 5m --camera-mount 0,-90,0
-      georef ingest flight --images photos --geo geo.txt --checkpoints checkpoints.txt --test-every 10
-    """,
-    "geolocate": """
-    Each point gets its own position, covariance, number of rays and intersection angle.
-
-    \b
-    Examples:
-      georef geolocate flight
-      georef geolocate flight --attitude sfm --min-angle 2
-    """,
-    "init-sim3": """
-    The default is robust and weighted by the covariances of the measurements; --method paper is the plain
-    least-squares estimate.
-
-    \b
-    Examples:
-      georef init-sim3 flight
-      georef init-sim3 flight --method paper
-      georef init-sim3 flight --max-residual 5
-    """,
-    "train": """
-    Interrupted with Ctrl-C it writes a checkpoint, and the next `georef train` goes on from there. Options that
-    would drop an interrupted training are refused without --force. A finished training is extended by more
-    --iterations.
-
-    \b
-    Examples:
-      georef train flight --preset fast
-      georef train flight --resume
-      georef train flight --iterations 4000
-      georef train flight --iterations 5000 --max-image-size 800 --backend cpu
-    """,
-    "clean": """
-    Gaussians go that are too transparent, float before the surface or far from everything, or lie outside a crop.
-    --gaussians keeps those that show most, merges the others into them, and fits them to the renders of the
-    trained model. The PSNR of the test views is stated before and after. The files of the splat (PLY, SPZ, tiles)
-    then take the cleaned model, as long as it was made from the trained one as it is; rasters, cloud and mesh keep
-    the trained one.
-
-    \b
-    Examples:
-      georef clean flight
-      georef clean flight --gaussians 1500000
-      georef clean flight --crop --sh-degree 1 --gaussians 500000
-    """,
-    "export-raster": """
-    Cloud Optimized GeoTIFF in a CRS. The orthophoto is a true one, of the photographs themselves: walls do not
-    lean. Cells that were not measured have no value, but for narrow holes. FILE.georef.json beside each raster
-    states CRS, datum of the heights and accuracy. hillshade.png and preview.png show surface and orthophoto.
-
-    \b
-    Examples:
-      georef export-raster flight
-      georef export-raster flight --crs EPSG:32632+3855 --gsd 0.05 --contours 1
-      georef export-raster flight --to delivery/raster
-    """,
-    "export-cloud": """
-    The points come from the depths of the trained model that several training views agree on, one in each voxel,
-    with colour, normal, and predicted horizontal and vertical σ. FILE.georef.json beside the cloud states its CRS,
-    vertical datum and accuracy.
-
-    \b
-    Examples:
-      georef export-cloud flight
-      georef export-cloud flight --crs EPSG:32632+3855 --spacing 0.1 --to flight.laz
-      georef export-cloud flight --crs EPSG:25832 --vertical EPSG:7837 --ply
-    """,
-    "export-mesh": """
-    The surface goes through the points of the cloud and closes narrow gaps between them. Colours are those of the
-    photographs: mesh.ply has coloured vertices with their σ, mesh.glb a texture. FILE.georef.json beside each
-    states its place on Earth, its accuracy, the error of the simplification and the holes.
-
-    \b
-    Examples:
-      georef export-mesh flight
-      georef export-mesh flight --voxel 0.1 --watertight --to flight.ply
-      georef export-mesh flight --crs EPSG:25832 --vertical EPSG:7837 --obj
-    """,
-    "export-spz": """
-    An SPZ file is a tenth of the PLY. Its axes are east, up and south in metres. FILE.georef.json beside it states
-    the place of that frame on Earth, and its accuracy.
-
-    \b
-    Examples:
-      georef export-spz flight
-      georef export-spz flight --to splat.spz --spz-version 4
-    """,
-    "export-tiles": """
-    The folder is ready for a web server: tileset.json with levels of detail in Earth-centred coordinates, its
-    contents, splat.glb, the whole splat in one file, and index.html, which shows the tiles in CesiumJS. The files
-    *.georef.json state the place on Earth and its accuracy.
-
-    \b
-    Examples:
-      georef export-tiles flight
-      georef export-tiles flight --to www/flight --max-tile-gaussians 100000
-      georef export-tiles flight --compression none --archive --to plain
-      georef export-tiles flight --crs EPSG:2056 --cesium Cesium/
-    """,
-    "export-html": """
-    One file that any browser opens from the disk or from a mail, without a server and without a network: the splat,
-    the cameras, control and check points, the measurements saved in `georef view`, accuracy and cautions. A splat
-    too large for --max-megabytes is reduced, and the page says by how much.
-
-    \b
-    Examples:
-      georef export-html flight
-      georef export-html flight --to flight.html --max-megabytes 10
-      georef export-html flight --crs EPSG:2056 --sh-degree 1
-    """,
-    "export-cameras": """
-    colmap/ and transforms.json (nerfstudio) are in the frame of splat.ply, as is undistorted/: photographs without
-    lens distortion and their COLMAP model, for other trainers. cameras.csv has positions in the CRS of the
-    contract, angles (omega phi kappa against grid north, yaw pitch roll against true north) and sigma.
-    footprints.geojson shows on a map what each photograph shows.
-
-    \b
-    Examples:
-      georef export-cameras flight
-      georef export-cameras flight --crs EPSG:32632 --to handover/cameras
-      georef export-cameras flight --undistorted --to trainer
-    """,
-    "export-opf": """
-    Open Photogrammetry Format 1.0: adjusted cameras and lenses, tie points, measured positions, control and check
-    points with their marks. Put it beside the photographs, whose names it lists. Without --crs, its map is a
-    projection around the scene that is true to scale there.
-
-    \b
-    Examples:
-      georef export-opf flight
-      georef export-opf flight --to handover/opf
-      georef export-opf flight --crs EPSG:32632+3855
-    """,
-    "report": """
-    A cover with names, logo, pictures and the facts of the survey; verdicts with their rules; accuracy, control and
-    check points with cuts of the photographs, positions, overlap, lenses and test views; in an appendix, the
-    processing. Options, hashes and warnings are folded, and not in the PDF. The page is one file and needs no
-    network. It shows what was made: make rasters first, whose previews are on the cover.
-
-    \b
-    Examples:
-      georef report flight
-      georef report flight --pdf --crs EPSG:32632+3855
-      georef report flight --pdf --title "Gravel pit" --client "City of X" --author "Y Survey" --logo logo.png
-      georef report flight --to handover/report.html
-    """,
-    "change": """
-    WS1 is the earlier epoch, WS2 the later one, which gets the folder change/: rasters of the difference of
-    heights, its σ, its level of detection at 95 % and the significant change; regions with cut, fill and net volume
-    ± σ as GeoJSON, GeoPackage and table; change.json. Both need the rasters of georef export-raster, in one --crs.
-
-    Without registration, the σ of both adjustments counts, less what they share: control points of one name and
-    place, and the base with --same-base. --stable FILE or --stable-auto registers the later epoch on unchanged
-    ground; the shift is stated with its σ.
-
-    \b
-    Examples:
-      georef change spring autumn
-      georef change spring autumn --stable roads.geojson --regions stockpiles.gpkg
-      georef change spring autumn --stable-auto --of terrain
-    """,
-}
-_EXTRA = {"train": [flag("--resume", text="Continue the interrupted run; refuse other options.")]}
-_BEFORE = {"change": click.Argument(["before"], type=FOLDER, metavar="WS1")}
-_DELIVERS: dict[str, Literal["file", "folder"]] = {
-    "export-raster": "folder",
-    "export-cloud": "file",
-    "export-mesh": "file",
-    "export-spz": "file",
-    "export-tiles": "folder",
-    "export-html": "file",
-    "export-cameras": "folder",
-    "export-opf": "folder",
-    "report": "file",
-    "change": "folder",
-}
+if TYPE_CHECKING:
+    from pipelines.survey.block_plan import BlockPlan
+    from pipelines.train.blocks.parts import Parts
 
 
-def command(name: str) -> Command:
+def stage_command(name: str) -> StageCommand:
     """Return the command of a stage."""
-    return StageCommand(
-        name, _HELP[name], _EXTRA.get(name, ()), before=_BEFORE.get(name), delivers=_DELIVERS.get(name)
-    )
+    match name:
+        case "sfm":
+            return _SfmCommand(name, (_CHUNK, *ENGINE))
+        case "calibrate":
+            return StageCommand(name, more=_calibrated)
+        case "train":
+            return _TrainCommand(name, (_RESUME, _PART, *ENGINE), announced=True)
+        case "evaluate":
+            return StageCommand(name, (_POINTS,), more=_evaluated)
+        case "export-ply":
+            return _PlyCommand(name, (_MEASURABLE, *options.stage_options(_of_measurable(), _ONLY_MEASURABLE)))
+        case "change":
+            return StageCommand(name, before=click.Argument(["before"], type=options.FOLDER, metavar="WS1"))
+    return StageCommand(name)
+
+
+_CHUNK = click.Option(
+    ["--chunk"],
+    metavar="NAME",
+    hidden=True,
+    help="Work on this chunk of a large survey only, beside a `georef sfm` that has planned it.",
+)
+
+
+class _SfmCommand(StageCommand):
+    """Command of `sfm`, whose jobs call it with `--chunk`."""
+
+    def act(self, ctx: click.Context, **values: Any) -> None:
+        name = values.pop("chunk")
+        if name is None:
+            with requested_engine(values):
+                super().act(ctx, **values)
+            return
+        from pipelines.sfm.chunks import work_chunk
+
+        worked = work_chunk(values["workspace"], name, progress_for(ctx.obj))
+        if values["as_json"]:
+            print_json({"chunk": name, "ran": worked})
+
+
+_COMPONENTS = {"boresight": ("x", "y", "z"), "lever-arm": ("forward", "right", "down"), "time-offset": ("",)}
+
+
+def _calibrated(workspace: Workspace, values: Mapping[str, Any]) -> tuple[RenderableType, ...]:
+    if values["as_json"]:
+        return ()
+    calibration = load_json(RigCalibration, workspace.path(stages.RIG))
+    if not calibration.estimates:
+        return ()
+    parts = [] if calibration.rms_position_m is None else [f"{calibration.rms_position_m:.3f} m an axis"]
+    parts += [] if calibration.rms_attitude_deg is None else [f"{calibration.rms_attitude_deg:.2f}°"]
+    images, points = calibration.images, calibration.control_points
+    left_over = f"left over: {', '.join(parts)} ({images} images, {points} control points)"
+    return _estimates(calibration), literal(left_over)
+
+
+def _estimates(calibration: RigCalibration) -> Table:
+    table = plain_table("", "estimated", "± σ", "ingest", "unit", "", right=(1, 2, 3))
+    for estimate in calibration.estimates:
+        applied = "applied" if estimate in calibration.applied else "[dim]not applied[/]"
+        columns = (estimate.value, estimate.sigma, estimate.start, estimate.observable)
+        components = zip(_COMPONENTS[estimate.name], *columns, strict=True)
+        for component, value, sigma, start, observable in components:
+            name = f"{estimate.name} {component}".strip()
+            remark = applied if observable else "[yellow]not observable in this flight[/]"
+            table.add_row(name, f"{value:.4f}", f"{sigma:.4f}", f"{start:.4f}", estimate.unit, remark)
+    return table
+
+
+def _part(_ctx: click.Context, _param: click.Parameter, name: str | None) -> str | None:
+    if name is None or name.isdecimal() or name in _PARTS:
+        return name
+    raise click.BadParameter(f"{name!r} is neither the number of a block nor one of {', '.join(_PARTS)}.")
+
+
+_PARTS = {"plan": stages.PLAN_BLOCKS, "scaffold": stages.TRAIN_SCAFFOLD, "seams": stages.TRAIN_SEAMS}
+_PART = click.Option(
+    ["--part"],
+    metavar="PART",
+    callback=_part,
+    help="Work on this part of a training in blocks only: plan (divide the survey, and show the blocks), or the "
+    "number of a block.",
+)
+_RESUME = flag("--resume", text="Continue the interrupted run; refuse other options.")
+
+
+class _TrainCommand(StageCommand):
+    """Command of `train`, whose jobs in a training in blocks call it with `--part`."""
+
+    def act(self, ctx: click.Context, **values: Any) -> None:
+        part = values.pop("part")
+        with requested_engine(values):
+            if part is None:
+                super().act(ctx, **values)
+            elif part == "plan":
+                self._plan(ctx, values)
+            else:
+                self._run_part(ctx, part, values)
+
+    def renews(self, workspace: Workspace, flags: Flags) -> bool:
+        """Return whether a block was trained again, so that the model is merged anew."""
+        if not (workspace.root / stages.BLOCK_RECORD).exists():
+            return False
+        resolved: Any = stage_config(workspace, self.spec, flags)
+        return resolved.lidar is None and self._parts(workspace, flags).is_outdated()  # with LiDAR: no blocks
+
+    def _parts(self, workspace: Workspace, flags: Flags) -> Parts:
+        from pipelines.train.blocks.parts import Parts
+
+        resolved: Any = stage_config(workspace, self.spec, flags)
+        return Parts(workspace, resolved)
+
+    def _plan(self, ctx: click.Context, values: dict[str, Any]) -> None:
+        """Divide the survey into blocks, remember the options, and show the plan."""
+        from pipelines.train.estimate import block_processor_s
+
+        workspace = values["workspace"]
+        must_exist(workspace)
+        flags = self._flags(ctx, values)
+        parts = self._parts(workspace, flags[self.spec.name])
+        with workspace.lock("plan of blocks"):
+            remember(workspace.root, flags)
+        with boundary.logged_to_file(parts.variant(), stages.PLAN_BLOCKS):
+            outcome = parts.run(stages.PLAN_BLOCKS, force=values["force"], progress=progress_for(ctx.obj))
+        plan = parts.plan()
+        if values["as_json"]:
+            print_json({"stage": outcome.stage, "ran": outcome.ran, **plan.model_dump(mode="json")})
+            return
+        photo_px = load_json(Survey, workspace.path(stages.SURVEY)).largest_photograph_px
+        # On a GPU nothing was measured.
+        processor_s = None if parts.on_gpu() else block_processor_s(plan, photo_px, parts.options)
+        print_rich(*block_table(plan, parts.states(plan), processor_s))
+
+    def _run_part(self, ctx: click.Context, part: str, values: dict[str, Any]) -> None:
+        """Run a part as a job does: without the workspace's lock, which the process that started it may hold."""
+        if options.given(ctx, self.spec.options.model_fields):
+            raise click.UsageError(
+                "Options of the training belong to `georef train` without --part, or to the plan."
+            )
+        workspace, force, progress = values["workspace"], values["force"], progress_for(ctx.obj)
+        must_exist(workspace)
+        parts = self._parts(workspace, self._flags(ctx, values)[self.spec.name])
+        spec, number = _PARTS.get(part, stages.TRAIN_BLOCK), int(part) if part.isdecimal() else None
+        if number is not None:
+            parts.plan().block(number)
+        elif spec is stages.TRAIN_SCAFFOLD and (force or parts.why_missing(stages.SOLVE)):
+            parts.run(stages.SOLVE, force=force, progress=progress)
+        variant = parts.variant(number)
+        with boundary.logged_to_file(variant, spec):
+            outcome = parts.run(spec, number, force=force, progress=progress)
+        print_outcome(variant, outcome, as_json=values["as_json"], logged=is_logged(ctx.obj))
+
+
+def block_table(
+    plan: BlockPlan, states: Mapping[int, str], processor_s: Mapping[int, float] | None = None
+) -> list[Renderable]:
+    """Return the blocks of a plan, with what is known of their training, by number of the block.
+
+    A block is `trained`, or there is a reason why it must be. The time is that of one core; None: unknown.
+    """
+    heads = ["block", "photographs", "Gaussians", "in a view", "memory"] + ["processor time"] * bool(processor_s)
+    table = plain_table(*heads, "", right=list(range(len(heads))))
+    for block in plan.blocks:
+        table.add_row(
+            str(block.id),
+            str(len(block.cameras)),
+            f"{block.gaussians:,}".replace(",", " "),
+            f"{block.visible:,.0f}".replace(",", " "),
+            f"{block.peak_bytes / 2**30:.1f} GiB",
+            *([about(processor_s[block.id])] if processor_s else []),
+            literal(states.get(block.id, "")),
+        )
+    number = len(plan.blocks)
+    whole = f"{number} blocks of {plan.photographs} photographs, {plan.gaussians} Gaussians in all"
+    if plan.memory_bytes is not None:
+        whole += f", for workers with {plan.memory_bytes / 2**30:.1f} GiB"
+    if processor_s:
+        whole += f"; about {about(sum(processor_s.values()))} of one core for all of them"
+    return [table, whole]
+
+
+_POINTS = flag("--points", text="Print the errors of every check and control point.")
+
+
+def _evaluated(workspace: Workspace, values: Mapping[str, Any]) -> list[Group]:
+    """Return coordinates, and errors point by point if they are wanted."""
+    report = read_report(workspace.path(stages.REPORT))
+    return [*coordinate_tables(report), *(error_tables(report) if values["points"] else [])]
+
+
+_MEASURABLE = flag(
+    "--measurable",
+    text="Write splat.measurable.ply, with discs on the surface, for viewers that measure by centres.",
+)
+_ONLY_MEASURABLE = ("disc_spacing", "appearance_passes")
+
+
+def _of_measurable() -> type[StageOptions]:
+    return stages.BY_NAME["export-measurable"].options
+
+
+class _PlyCommand(StageCommand):
+    """Command of `export-ply`, or with --measurable of `export-measurable`."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        if ctx.params.pop("measurable"):
+            return StageCommand("export-measurable").invoke(ctx)
+        if given := options.given(ctx, _ONLY_MEASURABLE):
+            name = options.stage_option(_of_measurable(), next(iter(given))).opts[0]
+            raise click.UsageError(f"{name} is for --measurable, which is not given.")
+        return super().invoke(ctx)

@@ -5,8 +5,7 @@ from typing import Any
 
 from georef_cli import options, tables
 from georef_cli.command import Command
-from georef_cli.evaluation import evaluated_cameras, with_evaluation
-from georef_cli.output import print_json, print_rich
+from georef_cli.output import evaluated_cameras, print_json, print_rich, with_evaluation
 from pipelines.core import staleness as states
 from pipelines.core.manifest import Memo
 from pipelines.core.options import notation
@@ -51,14 +50,15 @@ command = Command(
         options.JSON,
     ],
     callback=_status,
-    help="""Show the state of every stage: missing, current, stale (its inputs or options have changed since),
-damaged (a file is not as the stage wrote it), interrupted or failed; the accuracy of the result; and the cautions,
-which limit it.
+    help="""
+        A stage is missing, current, stale (its inputs or options have changed since), damaged (a file is not as
+        the stage wrote it), interrupted or failed. The accuracy of the result follows, and the cautions that limit
+        it.
 
-\b
-Examples:
-  georef status flight
-  georef status flight --options
-  georef status flight --json
-""",
+        \b
+        Examples:
+          georef status flight
+          georef status flight --options
+          georef status flight --json
+        """,
 )

@@ -43,8 +43,7 @@ command = Command(
         options.JSON,
     ],
     callback=click.pass_context(_view),
-    help="""See the trained model in a browser, and measure in it.
-
+    help="""
         Points, distances, heights, areas and volumes are read from the model's own surface, as `georef evaluate`
         reads it, with σ from the joint covariance. Control points are marked in photographs, and written for --gcp.
         The page is served to this machine alone, at an address with a key. What is saved lies in the workspace's

@@ -17,6 +17,7 @@ TOPICS = {
 
 
 def topic_text(name: str) -> str:
+    """Return the text of a topic of `georef help`; that of presets with the table of the training's options."""
     text = resources.files(__name__).joinpath(f"{name}.txt").read_text(encoding="utf-8")
     if name != "presets":
         return text

@@ -47,7 +47,7 @@ _NARROW = 0.1  # second extent of a line over the first
 _FLAT = 0.02  # third extent of the layout over the first
 _GATE_FACTORS = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the stated σ
 
-_ADVICE = (
+_REMEDY = (
     "Add at least three control points that are not on one line (`georef ingest --gcp FILE`), or attitudes (yaw, "
     "pitch, roll of the camera) in the trajectory."
 )
@@ -219,7 +219,7 @@ class _Linearised:
 
 def _linearised(data: Correspondences, state: SimilarityState, prior: RotationPrior | None) -> _Linearised:
     mapped = state.geo_from_local.apply(data.in_local)
-    whitener = np.linalg.inv(np.linalg.cholesky(residual_covariances(data, state)))
+    whitener = statistics.root_information(residual_covariances(data, state))
     whitener = whitener * state.inlier[:, None, None]
     weight = (whitener**2).sum(axis=(1, 2))
     pivot = weight @ mapped / weight.sum()
@@ -231,7 +231,7 @@ def _linearised(data: Correspondences, state: SimilarityState, prior: RotationPr
     residual = (whitener @ residuals(data, state)[..., None]).ravel()
     jacobian = (whitener @ jacobian).reshape(len(residual), -1)
     if prior is not None:
-        root = np.linalg.inv(np.linalg.cholesky(prior.cov_rad2))
+        root = statistics.root_information(prior.cov_rad2)
         turn = log_so3(prior.rotation @ state.geo_from_local.rotation.T)
         residual = np.concatenate([residual, root @ turn])
         jacobian = np.concatenate([jacobian, root @ np.eye(3, jacobian.shape[1], 1)])
@@ -291,7 +291,8 @@ def align(data: Correspondences, rng: np.random.Generator, *, attitude: Rotation
         raise DegenerateGeometryError(
             "too-few-positions",
             f"{len(data)} fixes of registered images and control points can be used; at least three fixes or "
-            f"control points are needed. {_ADVICE}",
+            f"control points are needed.",
+            remedy=_REMEDY,
         )
     # Starts of the fixes and of the control points, else of both together.
     parts = [data.part(members) for members in (~data.control, data.control) if members.sum() >= 3]
@@ -321,7 +322,8 @@ def _open_rotation(data: Correspondences, candidates: Sequence[AdjustedSimilarit
     if len(data) < 3 or extent[1] < _NARROW * extent[0] or not candidates:
         return DegenerateGeometryError(
             "positions-on-a-line",
-            f"The positions lie on one line, and the rotation about it {size}. {_ADVICE}",
+            f"The positions lie on one line, and the rotation about it {size}.",
+            remedy=_REMEDY,
         )
     scale = candidates[0].state.geo_from_local.scale
     length_m, width_m = (scale * float(np.ptp(centred @ axis)) for axis in axes[:2])
@@ -334,8 +336,8 @@ def _open_rotation(data: Correspondences, candidates: Sequence[AdjustedSimilarit
         "block-too-small",
         f"The {len(data)} {measured} span {length_m:.0f} × {width_m:.0f} m, which is small against their σ of "
         f"{sigma_h_m:.2g} m horizontally and {sigma_v_m:.2g} m vertically: the rotation of the block {size}, and "
-        f"more than {np.degrees(_WORST_ROTATION_RAD):.0f}° are not used. State better σ if they are known "
-        f"({', '.join(options)}). {_ADVICE}",
+        f"more than {np.degrees(_WORST_ROTATION_RAD):.0f}° are not used.",
+        remedy=f"State better σ if they are known ({', '.join(options)}). {_REMEDY}",
     )
 
 

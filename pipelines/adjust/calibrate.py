@@ -13,10 +13,11 @@ from pipelines.adjust import rig_fit
 from pipelines.adjust.fix_patterns import FixPattern, pattern_of
 from pipelines.adjust.measurements import control_correspondences
 from pipelines.adjust.options import CalibrateOptions
+from pipelines.adjust.state import SIGMA_ARM_M, SIGMA_BORESIGHT_RAD, is_observed
 from pipelines.core.errors import DegenerateGeometryError, MissingProductError
 from pipelines.core.products import Remark, load_json, save_json
 from pipelines.core.stages import SPARSE, SURVEY, TRACK
-from pipelines.core.types import FloatArray, vector3
+from pipelines.core.types import BoolArray, FloatArray, vector3
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import log_so3
@@ -87,7 +88,7 @@ def calibrate(
     try:
         fit = rig_fit.fit_rig(data, start_s, track.nominal_from_cam, free)
     except DegenerateGeometryError as error:
-        return RigCalibration(wanted=wanted, problem=str(error))
+        return RigCalibration(wanted=wanted, problem=error.fault, remedy=error.remedy)
     found = _estimates(fit, track)
     estimates = [found[name] for name in wanted]
     to_apply = survey.estimate if options.apply is None else wanted if options.apply else ()
@@ -187,10 +188,14 @@ def _estimates(fit: rig_fit.RigFit, track: NavigationTrack) -> dict[RigParameter
     start_m = np.nan_to_num(track.antenna_in_body).mean(axis=0)
     value_s, sigma_s = np.array([fit.state.offset_s]), fit.sigma[rig_fit.OFFSET]
     value_deg, sigma_deg = np.degrees(log_so3(fit.state.boresight)), np.degrees(fit.sigma[rig_fit.BORESIGHT])
-    found: dict[RigParameter, tuple[Literal["s", "deg", "m"], float, FloatArray, FloatArray, FloatArray]] = {
-        "time-offset": ("s", rig_fit.LIMIT_OFFSET_S, value_s, sigma_s, start_s),
-        "boresight": ("deg", rig_fit.LIMIT_BORESIGHT_DEG, value_deg, sigma_deg, start_deg),
-        "lever-arm": ("m", rig_fit.LIMIT_ARM_M, start_m + fit.state.arm, fit.sigma[rig_fit.ARM], start_m),
+    sigma_m = fit.sigma[rig_fit.ARM]
+    offset_seen = sigma_s <= rig_fit.LIMIT_OFFSET_S
+    boresight_seen = is_observed("boresight", fit.sigma[rig_fit.BORESIGHT], SIGMA_BORESIGHT_RAD)
+    arm_seen = is_observed("lever-arm", sigma_m, SIGMA_ARM_M)
+    found: dict[RigParameter, tuple[Literal["s", "deg", "m"], BoolArray, FloatArray, FloatArray, FloatArray]] = {
+        "time-offset": ("s", offset_seen, value_s, sigma_s, start_s),
+        "boresight": ("deg", boresight_seen, value_deg, sigma_deg, start_deg),
+        "lever-arm": ("m", arm_seen, start_m + fit.state.arm, sigma_m, start_m),
     }
     return {
         name: RigEstimate(
@@ -199,9 +204,9 @@ def _estimates(fit: rig_fit.RigFit, track: NavigationTrack) -> dict[RigParameter
             value=tuple(value.tolist()),
             sigma=tuple(np.minimum(sigma, _ENDLESS).tolist()),
             start=tuple(start.astype(float).tolist()),
-            observable=tuple((sigma <= limit).tolist()),
+            observable=tuple(seen.tolist()),
         )
-        for name, (unit, limit, value, sigma, start) in found.items()
+        for name, (unit, seen, value, sigma, start) in found.items()
     }
 
 
@@ -244,21 +249,19 @@ def _warnings(calibration: RigCalibration, survey: Survey) -> tuple[Remark, ...]
         code = FIX_LAG if calibration.fix_lag.applied else FIX_LAG_OPEN
         warnings.append(Remark(code=code, sentence=calibration.fix_lag.sentence))
     if calibration.problem:
-        sentence = (
-            f"{calibration.problem} The values that `georef ingest` set stay: {', '.join(calibration.wanted)}."
-        )
-        return (*warnings, Remark(code="rig-not-calibrated", sentence=sentence))
+        sentence = f"{calibration.problem} The values that ingest set stay: {', '.join(calibration.wanted)}."
+        return (*warnings, Remark(code="rig-not-calibrated", sentence=sentence, remedy=calibration.remedy))
     warnings += [
         Remark(
             code="rig-not-observable",
             sentence=f"The {estimate.name} is not observable in this flight (σ {max(estimate.sigma):.2g} "
-            f"{estimate.unit}): the value that `georef ingest` set stays.",
+            f"{estimate.unit}): the value that ingest set stays.",
         )
         for estimate in calibration.estimates
         if not all(estimate.observable) and not (estimate.name == "time-offset" and warnings)
     ]
     missed = [name for name in survey.estimate if name not in calibration.wanted]
     if missed:
-        sentence = f"--estimate leaves out parameters that `georef ingest` was to estimate: {', '.join(missed)}."
-        warnings.append(Remark(code="rig-not-estimated", sentence=sentence))
+        sentence = f"Parameters that the survey was to estimate are left out: {', '.join(missed)}."
+        warnings.append(Remark(code="rig-not-estimated", sentence=sentence, remedy="--estimate can name them."))
     return tuple(warnings)

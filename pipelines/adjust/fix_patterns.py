@@ -28,7 +28,7 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.geometry.statistics import cauchy_weight, outlier_gate
+from pipelines.geometry.statistics import cauchy_weight, outlier_gate, root_information
 from pipelines.survey.survey import Survey
 
 _LEAST_IMAGES = 8
@@ -196,7 +196,7 @@ def _gathered(survey: Survey, model: SparseModel) -> tuple[tuple[str, ...], _Dat
     center = fixes.in_local[rows]
     data = _Data(
         position=fixes.in_geo[rows],
-        root=np.linalg.inv(np.linalg.cholesky(fixes.cov_in_geo[rows])),
+        root=root_information(fixes.cov_in_geo[rows]),
         center=center,
         local_from_cam=np.swapaxes(model.rotation_cam_from_local[cameras], 1, 2),
         time_s=time_s[rows],

@@ -76,27 +76,28 @@ def geolocate(survey: Survey, model: SparseModel, options: GeolocateOptions) -> 
     if len(fixes) == 0:
         return _without_positions(model, "The survey has no fixes: control points alone georeference the model.")
     prior, recorded = attitude_prior(survey, model), recorded_rotations(survey, model)
-    alignment, problem = None, ""
+    alignment, problem, remedy = None, "", ""
     try:
         alignment = align(fixes, np.random.default_rng(_ALIGNMENT_SEED), attitude=prior)
         if alignment.layout != "line" and survey.drifts:
             alignment = kept_level(alignment, level_of(survey, model, prior), fixes)
     except DegenerateGeometryError as error:
-        problem = str(error)
+        problem, remedy = error.fault, error.remedy
         log.info("fixes cannot be compared with the SfM model: %s", error)
     fixed = np.array([index[name] for name in fixes.name])
     both = int(np.isin(fixed, recorded.image).sum())
     if options.attitude == "recorded" and both < 2:
         raise InputError(
             "too-few-attitudes",
-            f"{both} images have a fix and an attitude; at least two are needed. Use --attitude auto or sfm.",
+            f"{both} images have a fix and an attitude; at least two are needed.",
             field="--attitude",
+            remedy="Use --attitude auto or sfm.",
         )
     complete = both == len(fixes) or (alignment is None and both >= 2)
     use_recorded = options.attitude == "recorded" or (options.attitude == "auto" and complete)
     if alignment is None and not use_recorded:
         # Control points may georeference the model nevertheless, or `init-sim3` finds the error of the fixes.
-        return _without_positions(model, f"The SfM points were not intersected. {problem}")
+        return _without_positions(model, f"The SfM points were not intersected. {problem}", remedy)
     warnings = _warnings(model, fixes, recorded, alignment, prior if use_recorded else None)
     used = recorded if use_recorded else None
     views, usable = _views(model, fixes, fixed, alignment, used, sigma_px=options.sigma_px)
@@ -116,9 +117,9 @@ def _few_points(inlier: BoolArray, consistent: BoolArray) -> Remark:
     if consistent.sum() < _MOST * len(inlier):
         return Remark(
             code="few-points-agree",
-            sentence=f"The rays of only {consistent.sum()} of {len(inlier)} points meet within their σ. Check the "
-            "attitudes, and the σ of fixes and attitudes (--sigma-h, --sigma-v, --sigma-attitude of `georef "
-            "ingest`).",
+            sentence=f"The rays of only {consistent.sum()} of {len(inlier)} points meet within their σ.",
+            remedy="Check the attitudes, and the σ of fixes and attitudes (--sigma-h, --sigma-v, --sigma-attitude "
+            "of `georef ingest`).",
         )
     return Remark(
         code="few-points-located",
@@ -128,10 +129,11 @@ def _few_points(inlier: BoolArray, consistent: BoolArray) -> Remark:
     )
 
 
-def _without_positions(model: SparseModel, why: str) -> Geolocation:
+def _without_positions(model: SparseModel, why: str, remedy: str = "") -> Geolocation:
     count = len(model.point_id)
     points = _points(model, Intersections.none(count), np.zeros(count, dtype=bool), "sfm")
-    return Geolocation(points, np.full(count, np.nan), why, (Remark(code="points-not-located", sentence=why),))
+    warning = Remark(code="points-not-located", sentence=why, remedy=remedy)
+    return Geolocation(points, np.full(count, np.nan), why, (warning,))
 
 
 def _points(model: SparseModel, found: Intersections, inlier: BoolArray, source: str) -> GeolocatedPoints:

@@ -67,8 +67,12 @@ class Hypothesis:
     geo_from_local: Similarity  # of the corrected fixes
     distance_m: FloatArray  # (n,) of the corrected fixes from the SfM model; NaN where the hypothesis says nothing
     price: float = 0.0  # of the unknowns that it adds, in units of −2 ln likelihood
+    remedy: str = ""  # what to type against it
 
 
+_IN_FEET = "The heights are in feet."
+# What to type, by sentence.
+_REMEDIES = {_IN_FEET: "Give a CRS whose vertical unit is the foot (--crs)."}
 # Code, sentence, fixes (n, 3) without the mistake, and price of its unknowns.
 _Change = tuple[str, str, FloatArray, float]
 
@@ -93,6 +97,7 @@ def _distances(similarity: Similarity, center_in_local: FloatArray, position_in_
 
 
 def hangs_upside_down(model: SparseModel, geo_from_local: Similarity) -> bool:
+    """Return whether the median camera of a model in `geo` has its upper edge, and its back, below it."""
     up_in_cam = model.rotation_cam_from_local @ geo_from_local.rotation[2]
     return float(np.median(-up_in_cam[:, 1] - up_in_cam[:, 2])) < _UPSIDE_DOWN
 
@@ -118,7 +123,8 @@ def explanation_of(fixes: StatedFixes) -> Hypothesis | None:
         with suppress(DegenerateGeometryError):
             similarity, scatter = fit(fixes.center_in_local, changed)
             distance = _distances(similarity, fixes.center_in_local, changed)
-            tried.append(Hypothesis(code, sentence, scatter, similarity, distance, price))
+            remedy = _REMEDIES.get(sentence, "")
+            tried.append(Hypothesis(code, sentence, scatter, similarity, distance, price, remedy))
     tried += _clock(fixes, 3.0 * of_one)
     good = [
         one
@@ -203,7 +209,7 @@ def _changed_axes(fixes: StatedFixes) -> Iterator[_Change]:
         0.0,
     )
     for code, sentence, factor in (
-        ("feet", "The heights are in feet: give a CRS whose vertical unit is the foot (--crs).", FOOT_M),
+        ("feet", _IN_FEET, FOOT_M),
         ("feet", "The heights are in metres, although the CRS has feet.", 1.0 / FOOT_M),
         ("heights-down", "The heights count downward.", -1.0),
     ):
@@ -280,6 +286,7 @@ def _without(fixes: StatedFixes, shape: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def vector_text(values: FloatArray) -> str:
+    """Return the components of a vector with signs and two decimals, in brackets."""
     return "(" + ", ".join(f"{value:+.2f}" for value in values) + ")"
 
 
@@ -295,11 +302,9 @@ def _clock(fixes: StatedFixes, price: float) -> Iterator[Hypothesis]:
         distance, position = np.full(len(fixes.name), np.nan), track.curve(fixes.time_s[rows] + offset)
         distance[rows] = _distances(similarity, fixes.center_in_local[rows], position)
         leap = ", as GPS time from UTC" if abs(abs(offset) - _LEAP_S) < 2.0 * _CLOCK_STEP_S else ""
-        sentence = (
-            f"The navigation clock differs by {offset:+.2f} s from the camera's{leap}. Correct the times, or let "
-            "`georef ingest --time-offset auto` estimate the offset."
-        )
-        yield Hypothesis("clock", sentence, scatter, similarity, distance, price)
+        sentence = f"The navigation clock differs by {offset:+.2f} s from the camera's{leap}."
+        remedy = "Correct the times, or let `georef ingest --time-offset auto` estimate the offset."
+        yield Hypothesis("clock", sentence, scatter, similarity, distance, price, remedy)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ that fits is named. One inconsistency is everyday work: a constant shift of all 
 up to five metres, as an autonomous base station causes. Then the control points decide the position.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,7 @@ from pipelines.adjust.hypotheses import (
     mirrored,
     vector_text,
 )
-from pipelines.adjust.joint import JointAdjustment
+from pipelines.adjust.joint import Consistency
 from pipelines.adjust.level import SIGMA_SLOPE, ground_normal
 from pipelines.adjust.measurements import (
     UnusedControlPoint,
@@ -31,6 +31,7 @@ from pipelines.adjust.measurements import (
     control_correspondences,
     fix_correspondences,
 )
+from pipelines.adjust.system import Linearised, Problem
 from pipelines.adjust.terms import ControlPoints, Fixes, Level
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import Remark
@@ -41,8 +42,10 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import median_spacing, outlier_gate, typical_sigma
 from pipelines.survey.report_parts import EstimatedError, Group, VarianceFactor
+from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
 
+Factors = Mapping[Group, VarianceFactor]
 _SIGMA_REJECTED = "sigma-rejected"
 _OTHER_PHOTOGRAPHS = "other-photographs"
 _SIGMA_OPTIONS: dict[Group, str] = {
@@ -91,38 +94,52 @@ class _Finding:
     code: str
     sentence: str
     ends: bool = False
+    remedy: str = ""
+
+    @property
+    def remark(self) -> Remark:
+        return Remark(code=self.code, sentence=self.sentence, remedy=self.remedy)
 
 
 def cautions_of(
     survey: Survey,
-    model: SparseModel,
-    joint: JointAdjustment,
+    scene: Scene,
+    near: Linearised,
+    consistency: Consistency,
     pattern: FixPattern | None = None,
     *,
     bent: bool = False,
 ) -> tuple[tuple[Remark, ...], tuple[Remark, ...]]:
     """Return the inconsistencies, which end the stage unless the user accepts them, and further limits.
 
-    `pattern` is that of the fixes; a lever arm in it is estimated by `joint`. Of a model that is known to be `bent`
-    fixes are not taken for those of other photographs.
+    `near` is the minimum in the scene; it has estimated the lever arm that the fixes' `pattern` shows, if any. Of a
+    model that is known to be `bent` fixes are not taken for those of other photographs.
     """
-    fixes = StatedFixes(survey, model)
-    findings, mistake = list(_upside_down(fixes, joint.geo_from_local)), _mistake_in_map(survey, model)
+    model, geo_from_local = scene.sparse, scene.geo_from_local(near.state.geo_from_model)
+    fixes, weighted, factors = StatedFixes(survey, model), consistency.weighted(survey), consistency.factors
+    findings, mistake = list(_upside_down(fixes, geo_from_local)), _mistake_in_map(survey, model)
     of_map = []
     if mistake is not None:
         sentence = f"Control points and fixes disagree: {mistake}"
         of_map.append(_Finding("control-map", sentence, ends=True))
     if not findings:
-        of_lag = list(_lag_of_fixes(fixes, joint, pattern))
-        findings += of_lag or ([] if of_map else _fixes_against_model(fixes, joint, bent=bent))
-        findings += _view(model, joint.geo_from_local)
-    findings += of_map or [*_shift_of_fixes(joint), *_control_points(joint)]
-    findings += _steep_ground(survey, model, joint)
-    findings += [*_attitudes(survey, fixes, joint), *_weak_checks(joint), *_assumed_sigmas(joint)]
-    ending, others = (
-        tuple(Remark(code=found.code, sentence=found.sentence) for found in findings if found.ends == ends)
-        for ends in (True, False)
-    )
+        of_lag = list(_lag_of_fixes(fixes, factors.get("fixes"), pattern))
+        up = geo_from_local.rotation[2]
+        findings += of_lag or (
+            [] if of_map else _fixes_against_model(fixes, weighted, near, consistency, up=up, bent=bent)
+        )
+        findings += _view(model, geo_from_local)
+    findings += of_map or [
+        *_shift_of_fixes(weighted, near.problem, consistency.biases),
+        *_control_points(weighted, near, consistency),
+    ]
+    findings += _steep_ground(survey, model, near.problem, geo_from_local)
+    findings += [
+        *_attitudes(survey, fixes, geo_from_local),
+        *_weak_checks(weighted, near.problem, factors),
+        *_assumed_sigmas(weighted, factors),
+    ]
+    ending, others = (tuple(found.remark for found in findings if found.ends == ends) for ends in (True, False))
     return ending, others
 
 
@@ -132,7 +149,7 @@ def unadjustable(
     """Return the inconsistencies of measurements that determine no adjustment, and perhaps no alignment (None)."""
     fixes = StatedFixes(survey, model)
     if geo_from_local is not None and hangs_upside_down(model, geo_from_local):
-        return tuple(Remark(code=one.code, sentence=one.sentence) for one in _upside_down(fixes, geo_from_local))
+        return tuple(one.remark for one in _upside_down(fixes, geo_from_local))
     if len(fixes.name) < _LEAST_FIXES:
         return ()
     try:
@@ -146,10 +163,11 @@ def unadjustable(
         and pattern.has_lag
         and (best is None or best.scatter_m >= _BETTER * pattern.scatter_m[1])
     ):
-        return (Remark(code="clock", sentence=lag_sentence(pattern)),)
+        return (_lag(pattern, ends=True).remark,)
     cause = "Check that they belong to these photographs." if best is None else best.sentence
     sentence = f"The fixes scatter by {scatter:.2f} m along each axis about the SfM model: no similarity fits them."
-    return (Remark(code=_OTHER_PHOTOGRAPHS if best is None else best.code, sentence=f"{sentence} {cause}"),)
+    code, remedy = (_OTHER_PHOTOGRAPHS, "") if best is None else (best.code, best.remedy)
+    return (Remark(code=code, sentence=f"{sentence} {cause}", remedy=remedy),)
 
 
 def marks_that_do_not_meet(unused: Sequence[UnusedControlPoint], mistake: str | None) -> tuple[Remark, ...]:
@@ -178,9 +196,10 @@ def _upside_down(fixes: StatedFixes, geo_from_local: Similarity) -> Iterator[_Fi
         return
     sentence = "The cameras hang upside down in this solution: the positions disagree with the SfM model."
     best = explanation_of(fixes)
-    if best is not None:
-        sentence += f" {_explained(best)}"
-    yield _Finding("upside-down", sentence, ends=True)
+    if best is None:
+        yield _Finding("upside-down", sentence, ends=True)
+    else:
+        yield _Finding("upside-down", f"{sentence} {_explained(best)}", ends=True, remedy=best.remedy)
 
 
 def _view(model: SparseModel, geo_from_local: Similarity) -> Iterator[_Finding]:
@@ -190,14 +209,17 @@ def _view(model: SparseModel, geo_from_local: Similarity) -> Iterator[_Finding]:
         yield _Finding("looks-at-sky", sentence)
 
 
-def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment, *, bent: bool) -> Iterator[_Finding]:
-    factor, drifts = joint.factors.get("fixes"), _drifts(joint)
+def _fixes_against_model(
+    fixes: StatedFixes, survey: Survey, near: Linearised, consistency: Consistency, *, up: FloatArray, bent: bool
+) -> Iterator[_Finding]:
+    """Yield the finding that the fixes scatter more than stated, in a solution with an upward direction (3,)."""
+    factor, drifts = consistency.factors.get("fixes"), _drifts(consistency.factors)
     if factor is None or (factor.applied <= _QUIET_FACTOR and not drifts):
         return
     is_wrong = _is_wrong(factor)
-    shift = _constant_shift(joint.residuals(Fixes.kind)[1])
-    if shift is not None and joint.problem.term(ControlPoints.kind) is not None:
-        yield _apart(-shift, joint.survey, ends=is_wrong)
+    shift = _constant_shift(consistency.missed(near, Fixes.kind)[1])
+    if shift is not None and near.problem.term(ControlPoints.kind) is not None:
+        yield _apart(-shift, survey, ends=is_wrong)
         return
     scatter_m, rejected = fixes.sigma_m * factor.applied**0.5, factor.count - factor.used
     if drifts:  # it has taken a part of the scatter, and explains more than any cause that leaves some
@@ -210,50 +232,56 @@ def _fixes_against_model(fixes: StatedFixes, joint: JointAdjustment, *, bent: bo
     sides += f", and {rejected} of {factor.count} are outliers." if rejected else "."
     best = explanation_of(fixes)
     if best is not None and drifts:
-        _, missed, used = joint.residuals(Fixes.kind)
+        _, missed, used = consistency.missed(near, Fixes.kind)
         left_m = float(np.sqrt((missed[used] ** 2).mean()))
-        tilt = joint.geo_from_local.rotation[2] @ best.geo_from_local.rotation[2]
+        tilt = up @ best.geo_from_local.rotation[2]
         if best.code in _IN_TIME or best.scatter_m > _FITS * left_m or tilt < np.cos(_TILTED_RAD):
             best = None
     if best is not None:
-        yield _Finding(best.code, f"{sides} {_explained(best)}", ends=is_wrong)
+        yield _Finding(best.code, f"{sides} {_explained(best)}", ends=is_wrong, remedy=best.remedy)
         return
     if drifts:
-        yield _drifting(drifts, joint)
+        yield _drifting(drifts, near)
         return
     if scatter_m > median_spacing(fixes.position_in_geo) / 2 and not bent:
-        code = _OTHER_PHOTOGRAPHS
-        remedy = "They are farther off than photographs are apart. Check that they belong to these photographs."
+        code, remedy = _OTHER_PHOTOGRAPHS, ""
+        cause = "They are farther off than photographs are apart. Check that they belong to these photographs."
     else:
-        code = _SIGMA_REJECTED
-        remedy = (
+        code, remedy = _SIGMA_REJECTED, f"State the σ with {_SIGMA_OPTIONS['fixes']}."
+        cause = (
             "No offset, time, axis or group of fixes explains the scatter: the fixes are noisier than their σ, or "
-            f"the SfM model is bent. Every σ of the result is enlarged. State the σ with {_SIGMA_OPTIONS['fixes']}."
+            "the SfM model is bent. Every σ of the result is enlarged."
         )
-    yield _Finding(code, f"{sides} {remedy}", ends=is_wrong and scatter_m > _WRONG_SCATTER_M)
+    ends = is_wrong and scatter_m > _WRONG_SCATTER_M
+    yield _Finding(code, f"{sides} {cause}", ends=ends, remedy=remedy)
 
 
-def _lag_of_fixes(fixes: StatedFixes, joint: JointAdjustment, pattern: FixPattern | None) -> Iterator[_Finding]:
+def _lag_of_fixes(
+    fixes: StatedFixes, factor: VarianceFactor | None, pattern: FixPattern | None
+) -> Iterator[_Finding]:
     """Yield the finding that residuals have the pattern of fixes at other times than those of the photographs."""
     if pattern is None or not pattern.has_lag:
         return
     other = explanation_of(fixes)
     if other is not None and other.scatter_m < _BETTER * pattern.scatter_m[1]:
         return
-    factor = joint.factors.get("fixes")
-    yield _Finding("clock", lag_sentence(pattern), ends=factor is not None and _is_wrong(factor))
+    yield _lag(pattern, ends=factor is not None and _is_wrong(factor))
 
 
-def lag_sentence(pattern: FixPattern) -> str:
-    """Return what the lag of the fixes is, and what to do."""
+def _lag(pattern: FixPattern, *, ends: bool) -> _Finding:
+    """Return the finding of a lag of the fixes."""
     along_m = abs(pattern.lag_s) * float(np.median(np.linalg.norm(pattern.velocity_in_geo, axis=1)))
-    return (
+    sentence = (
         f"The navigation clock differs by {pattern.lag_s:+.2f} ± {pattern.sigma_lag_s:.2f} s from the camera's: "
         f"the fixes {'lag' if pattern.lag_s > 0 else 'lead'} the exposures by {along_m:.2f} m along the motion. "
         f"Without that they scatter by {pattern.scatter_m[1]:.2f} m about the SfM model along an axis, with it by "
-        f"{pattern.scatter_m[0]:.2f} m. Correct the times, let `georef ingest --time-offset auto` estimate the "
-        "offset, or, for positions by photograph, `georef calibrate`."
+        f"{pattern.scatter_m[0]:.2f} m."
     )
+    remedy = (
+        "Correct the times, let `georef ingest --time-offset auto` estimate the offset, or, for positions by "
+        "photograph, `georef calibrate`."
+    )
+    return _Finding("clock", sentence, ends=ends, remedy=remedy)
 
 
 def arm_caution(pattern: FixPattern) -> Remark:
@@ -263,15 +291,16 @@ def arm_caution(pattern: FixPattern) -> Remark:
         f"The fixes have the pattern of a lever arm: the antenna is {forward:+.2f} ± {sigma_forward:.2f} m forward "
         f"and {right:+.2f} ± {sigma_right:.2f} m right of the camera. Without it they scatter by "
         f"{pattern.scatter_m[1]:.3f} m about the SfM model along an axis, with it by {pattern.scatter_m[0]:.3f} m. "
-        "It is estimated with the adjustment; state it with `georef ingest --lever-arm` and --camera-mount."
+        "It is estimated with the adjustment."
     )
-    return Remark(code="lever-arm", sentence=sentence)
+    remedy = "State it with `georef ingest --lever-arm` and --camera-mount."
+    return Remark(code="lever-arm", sentence=sentence, remedy=remedy)
 
 
-def _drifts(joint: JointAdjustment) -> list[VarianceFactor]:
+def _drifts(tested: Factors) -> list[VarianceFactor]:
     """Return the tests of the drift of the fixes that find it far larger than assumed."""
     groups: tuple[Group, ...] = ("horizontal drift", "vertical drift")
-    factors = [joint.factors[group] for group in groups if group in joint.factors]
+    factors = [tested[group] for group in groups if group in tested]
     return [factor for factor in factors if factor.applied > _DRIFT_FACTOR]
 
 
@@ -283,37 +312,39 @@ def _plain_scatter(fixes: StatedFixes) -> float:
         return 0.0
 
 
-def _drifting(drifts: Sequence[VarianceFactor], joint: JointAdjustment) -> _Finding:
-    fixes, errors = joint.problem.term(Fixes.kind), joint.problem.errors
+def _drifting(drifts: Sequence[VarianceFactor], near: Linearised) -> _Finding:
+    fixes, errors = near.problem.term(Fixes.kind), near.problem.errors
     assert isinstance(fixes, Fixes)
     drifting = np.array([block.name == "drift" for block in errors.blocks])
-    drift = fixes.shares(errors)[:, drifting] @ joint.state.errors.reshape(-1, 3)[drifting]
+    drift = fixes.shares(errors)[:, drifting] @ near.state.errors.reshape(-1, 3)[drifting]
     groups, spread = {factor.group for factor in drifts}, np.ptp(drift, axis=0)
     parts = []
     if "horizontal drift" in groups:
         parts.append(f"{float(spread[:2].max()):.0f} m horizontally")
     if "vertical drift" in groups:
         parts.append(f"{float(spread[2]):.0f} m in height")
-    level = joint.problem.term(Level.kind)
+    level = near.problem.term(Level.kind)
     by = (
         "Control points or nothing level the survey"
         if not isinstance(level, Level)
         else "What the photographs know of the vertical levels the survey, with a σ of "
-        f"{np.degrees(np.linalg.inv(level.root_information[0]).diagonal().max()):.1f}°"
+        f"{np.degrees(np.sqrt(level.cov[0].diagonal().max())):.1f}°"
     )
     sentence = (
         f"The recorded positions drift within the flight: against the photographs they change by {listed(parts)}, "
         f"far more than a receiver without corrections does. {by}; neither heights nor terrain are known better "
-        "than the σ of the result, which the drift enlarges. Give control points with --gcp, or other positions."
+        "than the σ of the result, which the drift enlarges."
     )
-    return _Finding("position-drift", sentence)
+    return _Finding("position-drift", sentence, remedy="Give control points with --gcp, or other positions.")
 
 
-def _steep_ground(survey: Survey, model: SparseModel, joint: JointAdjustment) -> Iterator[_Finding]:
+def _steep_ground(
+    survey: Survey, model: SparseModel, problem: Problem, geo_from_local: Similarity
+) -> Iterator[_Finding]:
     """Yield the finding that the ground is steeper than sites are, where the fixes may drift in height."""
-    if joint.problem.term(ControlPoints.kind) is not None or not survey.drifts:
+    if problem.term(ControlPoints.kind) is not None or not survey.drifts:
         return
-    up = joint.geo_from_local.rotation[2]
+    up = geo_from_local.rotation[2]
     normal = ground_normal(model, up)
     if normal is None:
         return
@@ -321,29 +352,26 @@ def _steep_ground(survey: Survey, model: SparseModel, joint: JointAdjustment) ->
     if _STEEP_SIGMAS * SIGMA_SLOPE < slope < _WALL_RAD:
         sentence = (
             f"The ground as a whole is inclined by {np.degrees(slope):.0f}° in this solution. If the site is not, "
-            "recorded heights that drift within the flight have tilted the survey. Check them, or give control "
-            "points with --gcp."
+            "recorded heights that drift within the flight have tilted the survey."
         )
-        yield _Finding("ground-steep", sentence)
+        yield _Finding("ground-steep", sentence, remedy="Check them, or give control points with --gcp.")
 
 
-def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
+def _shift_of_fixes(survey: Survey, problem: Problem, biases: Sequence[EstimatedError]) -> Iterator[_Finding]:
     """Yield the finding that the fixes of a session are shifted against the control points, beyond their σ."""
-    fixes = joint.problem.term(Fixes.kind)
+    fixes = problem.term(Fixes.kind)
     if fixes is None:
         return
-    for bias in joint.biases:
+    for bias in biases:
         information = (np.swapaxes(fixes.root_information, 1, 2) @ fixes.root_information).mean(axis=0)
         # The variance of an estimate under a prior is the prior's variance less the estimate's own (posterior).
         shift_m, variance = np.array(bias.value), np.square(bias.prior) - np.square(bias.sigma)
         # A datum that was only assumed explains no shift: the receiver's own common error is the measure. Of a zero
         # that is known to be doubtful, nothing else was expected.
-        of_datum = (
-            np.zeros(3) if bias.session is None else np.array(joint.survey.sessions[bias.session].sigma_datum_m)
-        )
-        if joint.problem.term(ControlPoints.kind) is None:
+        of_datum = np.zeros(3) if bias.session is None else np.array(survey.sessions[bias.session].sigma_datum_m)
+        if problem.term(ControlPoints.kind) is None:
             of_datum = np.zeros(3)
-        elif any(image.fix is not None and image.fix.sigma_zero_m for image in joint.survey.images):
+        elif any(image.fix is not None and image.fix.sigma_zero_m for image in survey.images):
             of_datum[2] = 0.0
         variance = np.maximum(variance, 1e-9) * _without_datum(bias, np.square(of_datum))
         if (shift_m**2 / np.maximum(variance, 1e-9)).sum() <= outlier_gate(3):
@@ -356,7 +384,7 @@ def _shift_of_fixes(joint: JointAdjustment) -> Iterator[_Finding]:
         sentence = (
             f"All fixes are shifted by ({values}) m east, north, up against the control points, which determine "
             f"the position; the σ of the fixes' common error is ({stated}) m. Either side may be wrong. Check "
-            f"{_cause_of_shift(shift_m, joint.survey)}."
+            f"{_cause_of_shift(shift_m, survey)}."
         )
         within_one_fix = bool(shift_m @ information @ shift_m <= outlier_gate(3))
         is_everyday = bool(np.linalg.norm(shift_m) <= _EVERYDAY_SHIFT_M)
@@ -376,26 +404,26 @@ def _without_datum(bias: EstimatedError, of_datum: FloatArray) -> FloatArray:
     return np.asarray((of_receiver + observed) / (prior + observed))
 
 
-def _control_points(joint: JointAdjustment) -> Iterator[_Finding]:
-    names, residual, used = joint.residuals(ControlPoints.kind)
-    factor = joint.factors.get("control points")
+def _control_points(survey: Survey, near: Linearised, consistency: Consistency) -> Iterator[_Finding]:
+    names, residual, used = consistency.missed(near, ControlPoints.kind)
+    factor = consistency.factors.get("control points")
     if factor is None:
         return
     shift = _constant_shift(residual)
-    if (
-        shift is not None
-        and joint.problem.term(Fixes.kind) is not None
-        and (factor.applied > 1.0 or not used.all())
-    ):
-        yield _apart(shift, joint.survey, ends=True)
+    if shift is not None and near.problem.term(Fixes.kind) is not None and (factor.applied > 1.0 or not used.all()):
+        yield _apart(shift, survey, ends=True)
     elif factor.applied > _QUIET_FACTOR:
         scatter_m = float(np.sqrt((residual**2).mean()))
         sentence = (
             f"The residuals of the control points are {scatter_m:.2f} m RMS along each axis; their "
-            f"{_source(factor)} σ is {_before_adjustment(factor, joint.survey)}. Check coordinates, marks and the "
+            f"{_source(factor)} σ is {_before_adjustment(factor, survey)}. Check coordinates, marks and the "
             f"SfM model, or state the σ with {_SIGMA_OPTIONS['control points']}. Every σ of the result is enlarged."
         )
-        yield _Finding(_SIGMA_REJECTED, sentence, ends=_is_wrong(factor) and scatter_m > _WRONG_SCATTER_M)
+        remedy = (
+            f"Check coordinates, marks and the SfM model, or state the σ with {_SIGMA_OPTIONS['control points']}."
+        )
+        ends = _is_wrong(factor) and scatter_m > _WRONG_SCATTER_M
+        yield _Finding(_SIGMA_REJECTED, sentence, ends=ends, remedy=remedy)
     elif not used.all():
         missed_m = np.linalg.norm(residual, axis=1)
         rejected = [f"{names[row]} ({missed_m[row]:.2f} m)" for row in np.flatnonzero(~used)]
@@ -420,7 +448,7 @@ def _apart(shift_m: FloatArray, survey: Survey, *, ends: bool) -> _Finding:
     return _Finding("control-shifted", sentence, ends)
 
 
-def _attitudes(survey: Survey, fixes: StatedFixes, joint: JointAdjustment) -> Iterator[_Finding]:
+def _attitudes(survey: Survey, fixes: StatedFixes, geo_from_local: Similarity) -> Iterator[_Finding]:
     """Yield the finding that the attitudes disagree with the solution.
 
     A compass is often off by degrees, whatever its σ. A small turn is therefore reported only if a clock offset
@@ -429,7 +457,7 @@ def _attitudes(survey: Survey, fixes: StatedFixes, joint: JointAdjustment) -> It
     prior = attitude_prior(survey, fixes.model)
     if prior is None:
         return
-    sigma, angle = float(np.sqrt(prior.cov_rad2[0, 0])), turn_against(prior, joint.geo_from_local)
+    sigma, angle = float(np.sqrt(prior.cov_rad2[0, 0])), turn_against(prior, geo_from_local)
     if angle <= _CLOCK_SIGMAS * sigma:
         return
     clock = clock_that_turns(fixes, prior)
@@ -450,8 +478,8 @@ def _attitudes(survey: Survey, fixes: StatedFixes, joint: JointAdjustment) -> It
     yield _Finding("attitudes-inconsistent", sentence)
 
 
-def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:
-    tested = [factor for factor in joint.factors.values() if factor.group in ("fixes", "control points")]
+def _weak_checks(survey: Survey, problem: Problem, factors: Factors) -> Iterator[_Finding]:
+    tested = [factor for factor in factors.values() if factor.group in ("fixes", "control points")]
     redundancy = sum(factor.redundancy for factor in tested)
     if redundancy < 6.0:
         sentence = (
@@ -459,37 +487,38 @@ def _weak_checks(joint: JointAdjustment) -> Iterator[_Finding]:
             "go unnoticed. Add fixes or control points."
         )
         yield _Finding("hardly-checked", sentence)
-    if joint.problem.term(Fixes.kind) is not None and joint.factors.get("control points") is None:
-        fixes = [image.fix for image in joint.survey.images if image.fix is not None]
+    if problem.term(Fixes.kind) is not None and factors.get("control points") is None:
+        fixes = [image.fix for image in survey.images if image.fix is not None]
         sigma = typical_sigma(np.array([fix.cov_apart for fix in fixes]))
-        drift_m = max((max(session.drift_m) for session in joint.survey.sessions), default=0.0)
+        drift_m = max((max(session.drift_m) for session in survey.sessions), default=0.0)
         beside = f" but for a drift of σ {drift_m:.2g} m" if drift_m else ""
         sentence = (
             "No control point checks an error that all fixes share, such as that of the base station. The "
-            f"predicted σ take the errors of the fixes, σ {sigma:.2g} m, as independent{beside}. Add control "
-            "points with --gcp."
+            f"predicted σ take the errors of the fixes, σ {sigma:.2g} m, as independent{beside}."
         )
-        yield _Finding("no-control-points", sentence)
+        yield _Finding("no-control-points", sentence, remedy="Add control points with --gcp.")
 
 
-def _assumed_sigmas(joint: JointAdjustment) -> Iterator[_Finding]:
+def _assumed_sigmas(survey: Survey, factors: Factors) -> Iterator[_Finding]:
     """Yield the finding that σ are assumed; a group whose σ another finding rejects is left out."""
-    sentences = []
+    sentences, remedies = [], []
     for group, options in _SIGMA_OPTIONS.items():
-        factor = joint.factors.get(group)
+        factor = factors.get(group)
         if factor is None or factor.sigma_source != "default":
             continue
-        assumed = _before_adjustment(factor, joint.survey)
+        assumed = _before_adjustment(factor, survey)
         if factor.estimated is None:
-            sentences.append(f"Nothing checks the assumed σ of the {group}, {assumed}: state it with {options}.")
+            sentences.append(f"Nothing checks the assumed σ of the {group}, {assumed}.")
         elif group == "marks" or factor.applied <= _QUIET_FACTOR:
             variance = factor.estimated if factor.applied == 1.0 else factor.applied
             ratio = f"{variance**0.5:.2g}"
-            sentences.append(
-                f"The {group} scatter {ratio} times their assumed σ of {assumed}: state it with {options}."
-            )
+            sentences.append(f"The {group} scatter {ratio} times their assumed σ of {assumed}.")
+        else:
+            continue
+        remedies.append(f"State that of the {group} with {options}.")
     if sentences:
-        yield _Finding("default-sigma", " ".join((*sentences, "Every σ of the result depends on these.")))
+        sentence = " ".join((*sentences, "Every σ of the result depends on these."))
+        yield _Finding("default-sigma", sentence, remedy=" ".join(remedies))
 
 
 def _before_adjustment(factor: VarianceFactor, survey: Survey) -> str:

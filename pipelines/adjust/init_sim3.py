@@ -1,7 +1,8 @@
 """Stage `init-sim3`: the similarity `geo_from_local` from the SfM model to the Earth.
 
-Reads `ingest/survey.json`, `sfm/sparse`, `geolocate/points.npz`; writes `sim3/geo_from_local.json`
-and the adjustment, `sim3/adjustment.json` and `.npz`.
+Reads `ingest/survey.json`, `sfm/sparse`, `geolocate/points.npz`; writes the solution, `sim3/adjustment.json` and
+its covariances, `.npz`. The solution names the similarity that it begins with, and how that was found; for other
+programs, `sim3/geo_from_local.json` has this alone.
 GeoRefGS section 2.4.1, eqs 16–21 (doi 10.3390/drones10030195), is `--method paper`. The default starts from a
 robust alignment of camera centres and control points, adjusts similarity, cameras and lens together, and tests the
 stated σ. `pipelines.adjust.alignment` explains why the intersected points are no observations.
@@ -11,7 +12,7 @@ A survey without a place on Earth gets a local metric frame (`pipelines.adjust.l
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,7 +35,7 @@ from pipelines.adjust.inconsistencies import (
     mistake_in_marks,
     unadjustable,
 )
-from pipelines.adjust.joint import JointAdjustment, Start, adjust_jointly, component_of, in_own_frame
+from pipelines.adjust.joint import Consistency, Start, adjust_jointly, component_of, in_own_frame
 from pipelines.adjust.lens_cautions import focal_length_of, rolling_shutter_of
 from pipelines.adjust.level import level_of, levelled
 from pipelines.adjust.local_frame import local_similarity
@@ -51,7 +52,7 @@ from pipelines.adjust.measurements import (
 from pipelines.adjust.options import EstimatedErrorName, InitSim3Options
 from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.solution import adjusted
-from pipelines.adjust.system import minimise
+from pipelines.adjust.system import Linearised, minimise
 from pipelines.adjust.terms import ControlPoints, Distances, Fixes
 from pipelines.adjust.tied import cautions_of_common, outliers_in_common, start_at_common
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InconsistencyError, InputError
@@ -64,23 +65,15 @@ from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.similarity import Similarity, SimilarityRecord, jacobian_at, spread_ratio_similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import ResidualStats, residual_stats, squared_mahalanobis
-from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
+from pipelines.survey.adjustment import GeolocatedPoints, MeasurementVerdict, SimilarityEstimate
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
-from pipelines.survey.scene import initial_scene
+from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.solution import Solution
 from pipelines.survey.survey import Survey
 
 _DISAGREE = 3.5  # σ by which a distance misses the solution; one in two thousand does by chance
 _LEVEL = 0.01  # of the χ² test of σ where no joint adjustment is possible
-
-
-@dataclass(frozen=True)
-class Estimated:
-    """Result of init-sim3: similarity with the verdict on the measurements, adjustment, warnings for the user."""
-
-    initial: InitialSimilarity
-    posterior: Posterior
-    warnings: tuple[Remark, ...]
 
 
 def run(stage: StageRun, options: InitSim3Options) -> Summary:
@@ -88,17 +81,19 @@ def run(stage: StageRun, options: InitSim3Options) -> Summary:
     survey = load_survey(stage.workspace)
     model = read_sparse(stage.workspace.path(SPARSE))
     points = GeolocatedPoints.load(stage.workspace.path(POINTS))
-    estimated = estimate_similarity(survey, model, points, options)
-    save_json(estimated.initial, stage.out / Path(SIM3).name)
-    save_json(estimated.posterior.solution, stage.out / Path(ADJUSTMENT).name)
-    save_posterior(estimated.posterior, stage.out / Path(SIM3_POSTERIOR).name)
-    return _summary(estimated, is_local=survey.origin is None)
+    posterior, warnings = estimate_similarity(survey, model, points, options)
+    solution = posterior.solution
+    save_json(solution, stage.out / Path(ADJUSTMENT).name)
+    save_json(_initial_of(solution), stage.out / Path(SIM3).name)
+    save_posterior(posterior, stage.out / Path(SIM3_POSTERIOR).name)
+    figure, values = _figures(solution, is_local=survey.origin is None)
+    return Summary(figure, values, warnings, solution.cautions)
 
 
 def estimate_similarity(
     survey: Survey, model: SparseModel, points: GeolocatedPoints, options: InitSim3Options
-) -> Estimated:
-    """Return the initial similarity with the adjustment, and warnings for the user.
+) -> tuple[Posterior, tuple[Remark, ...]]:
+    """Return the solution with its covariances and its `initial` similarity, and warnings for the user.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open; names further measurements.
@@ -109,24 +104,26 @@ def estimate_similarity(
     if not np.array_equal(points.point_id, model.point_id):
         raise InputError(
             "points-of-another-model",
-            "The intersected points belong to another SfM model. Run `georef geolocate` again.",
+            "The intersected points belong to another SfM model.",
+            remedy="Run `georef geolocate` again.",
         )
     if not options.control_points:
         survey = survey.model_copy(update={"control_points": ()})
     if options.method == "paper":
         control, unused = control_correspondences(survey, model)
         initial = similarity_by_paper(model, points, fix_correspondences(survey, model).joined(control))
-        posterior = solved(survey, model, initial, options.estimate)
-        estimated = Estimated(initial, posterior, _of_unused(unused))
+        posterior = solved(survey, model, initial, estimate=options.estimate)
+        warnings = _of_unused(unused)
     elif survey.origin is None:
-        estimated = similarity_by_distances(survey, model, points, options)
+        posterior, warnings = similarity_by_distances(survey, model, points, options)
     else:
-        estimated = robust_similarity(survey, model, points, options)
-    _check_residual(estimated.initial, options.max_residual)
-    return estimated
+        posterior, warnings = robust_similarity(survey, model, points, options)
+    _check_residual(posterior.solution, options.max_residual)
+    return posterior, warnings
 
 
-def _check_residual(initial: InitialSimilarity, limit_m: float | None) -> None:
+def _check_residual(solution: Solution, limit_m: float | None) -> None:
+    initial = _initial_of(solution)
     kind: Literal["gnss", "gcp"] = "gnss" if initial.residuals["gnss"].count else "gcp"
     stats = initial.residuals[kind]
     if limit_m is None or stats.rmse_3d_m is None or stats.rmse_3d_m <= limit_m:
@@ -134,14 +131,22 @@ def _check_residual(initial: InitialSimilarity, limit_m: float | None) -> None:
     what = "camera centres" if kind == "gnss" else "control points"
     raise ConvergenceError(
         "residual-above-limit",
-        f"The RMS residual of {stats.count} {what} is {stats.rmse_3d_m:.3f} m (horizontal {stats.rmse_h_m:.3f} m, "
-        f"vertical {stats.rmse_v_m:.3f} m), more than {limit_m:g} m. Look for wrong positions or a bent SfM model, "
-        "or raise --max-residual.",
+        (
+            f"The RMS residual of {stats.count} {what} is {stats.rmse_3d_m:.3f} m (horizontal "
+            f"{stats.rmse_h_m:.3f} m, vertical {stats.rmse_v_m:.3f} m), more than {limit_m:g} m."
+        ),
+        remedy="Look for wrong positions or a bent SfM model, or raise --max-residual.",
     )
 
 
-def _summary(estimated: Estimated, *, is_local: bool) -> Summary:
-    initial = estimated.initial
+def _initial_of(solution: Solution) -> SimilarityEstimate:
+    assert solution.initial is not None  # of `solved`
+    return solution.initial
+
+
+def _figures(solution: Solution, *, is_local: bool) -> tuple[str, dict[str, Any]]:
+    """Return the key figure and the values of the summary."""
+    initial, earlier = _initial_of(solution), solution.earlier
     sigma = np.sqrt(np.maximum(np.diag(np.array(initial.geo_from_local.covariance)), 0.0))
     parts = [
         f"{kind} {stats.rmse_3d_m:.3f} m RMS of {stats.count}"
@@ -150,7 +155,6 @@ def _summary(estimated: Estimated, *, is_local: bool) -> Summary:
     ]
     position = float(np.linalg.norm(sigma[4:]))
     figure = f"σ of the georeference alone {position:.3f} m; residuals {', '.join(parts)}"
-    earlier = estimated.posterior.solution.earlier
     if earlier is not None:
         figure += f"; tied to {Path(earlier.workspace).name} by {earlier.used} of {earlier.points} points in common"
     if is_local:
@@ -165,22 +169,17 @@ def _summary(estimated: Estimated, *, is_local: bool) -> Summary:
         "condition_number": initial.condition_number,
         "inliers": initial.inliers,
         "earlier": None if earlier is None else earlier.model_dump(),
-        "gnss_outliers": list(initial.gnss_outliers),
-        "variance_factors": [factor.model_dump() for factor in initial.variance_factors],
+        "gnss_outliers": list(solution.gnss_outliers),
+        "variance_factors": [factor.model_dump() for factor in solution.variance_factors],
         "residuals": {kind: stats.model_dump() for kind, stats in initial.residuals.items()},
     }
-    return Summary(
-        figure,
-        values,
-        estimated.warnings,
-        initial.cautions,
-    )
+    return figure, values
 
 
 def robust_similarity(
     survey: Survey, model: SparseModel, points: GeolocatedPoints, options: InitSim3Options
-) -> Estimated:
-    """Return the similarity by the robust method; raises as `estimate_similarity`."""
+) -> tuple[Posterior, tuple[Remark, ...]]:
+    """Return the solution by the robust method; raises as `estimate_similarity`."""
     control, unused = control_correspondences(survey, model)
     mistake = mistake_in_marks(survey, model) if unused else None
     if mistake is not None:  # What meets all the same meets in a wrong place.
@@ -192,9 +191,11 @@ def robust_similarity(
     except DegenerateGeometryError as error:
         _refuse(unadjustable(survey, model, None), options)
         reasons = [positions_in_use(survey, model, data, unused), *(caution.sentence for caution in of_marks)]
-        raise DegenerateGeometryError(error.code, " ".join((str(error), *reasons))) from error
-    aligned = _aligned_product(model, points, data, alignment).model_copy(
-        update={"control_outliers": tuple(p.name for p in survey.control_points if p.name not in control.name)}
+        raise DegenerateGeometryError(error.code, " ".join((error.fault, *reasons)), remedy=error.remedy) from error
+    aligned, inlier = _aligned_product(model, points, data, alignment), alignment.solution.state.inlier
+    verdict = MeasurementVerdict(
+        gnss_outliers=tuple(name for name, bad in zip(data.name, ~inlier & ~data.control, strict=True) if bad),
+        control_outliers=tuple(p.name for p in survey.control_points if p.name not in control.name),
     )
     warnings = () if mistake else _of_unused(unused)  # else the caution says why
     warnings += of_wrong_marks(wrong_marks(survey.control_points, model))
@@ -211,97 +212,107 @@ def robust_similarity(
             *_levelled_start(survey, model, data, aligned),
             *_starts(data, aligned, options.seed),
         )
-        joint = adjust_jointly(meets, model, starts, estimate=options.estimate)
+        scene, near, consistency = adjust_jointly(meets, model, starts, estimate=options.estimate)
     except DegenerateGeometryError as error:
         inconsistencies = unadjustable(meets, model, alignment.geo_from_local, pattern)
         _refuse(inconsistencies, options)
-        unchecked = Remark(code=NOT_CHECKED, sentence=f"Nothing checks the stated σ. {error}")
+        unchecked = Remark(
+            code=NOT_CHECKED, sentence=f"Nothing checks the stated σ. {error.fault}", remedy=error.remedy
+        )
         cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, (unchecked,))
-        initial = _without_joint(aligned, alignment.solution, cautions)
-        return Estimated(initial, solved(survey, model, initial, options.estimate), warnings)
-    motion, of_lens = joint.problem.bundle.row_motion, focal_length_of(survey, model)
-    inconsistencies, limits = cautions_of(meets, model, joint, pattern, bent=bool(of_lens))
-    of_lens += rolling_shutter_of(survey, model, joint.geo_from_local.scale, motion)
+        initial = _without_joint(aligned, alignment.solution)
+        verdict = verdict.model_copy(update={"cautions": cautions})
+        return solved(survey, model, initial, verdict, estimate=options.estimate), warnings
+    motion, of_lens = near.problem.bundle.row_motion, focal_length_of(survey, model)
+    inconsistencies, limits = cautions_of(meets, scene, near, consistency, pattern, bent=bool(of_lens))
+    scale = scene.geo_from_local(near.state.geo_from_model).scale
+    of_lens += rolling_shutter_of(survey, model, scale, motion)
     _refuse(inconsistencies, options)
-    initial, more = _joint_product(model, points, aligned, joint)
-    of_earlier = cautions_of_common(survey, joint)
+    initial, verdict, more = _joint_product(points, (aligned, verdict), scene, near, consistency)
+    of_earlier = cautions_of_common(survey, near, consistency)
     cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, of_lens, limits, of_earlier)
     told = {caution.code for caution in cautions}
-    initial = initial.model_copy(update={"cautions": cautions})
-    posterior = solved(survey, model, initial, options.estimate, joint)
-    initial = initial.model_copy(update={"geo_from_local": posterior.solution.similarity_from_local()})
-    return Estimated(initial, posterior, warnings + tuple(one for one in more if one.code not in told))
+    verdict = verdict.model_copy(update={"cautions": cautions})
+    posterior = solved(survey, model, initial, verdict, estimate=options.estimate, joint=(scene, near))
+    return posterior, warnings + tuple(one for one in more if one.code not in told)
 
 
 def similarity_by_distances(
     survey: Survey, model: SparseModel, points: GeolocatedPoints, options: InitSim3Options
-) -> Estimated:
-    """Return the similarity into a local metric frame, whose scale known distances set.
+) -> tuple[Posterior, tuple[Remark, ...]]:
+    """Return the solution in a local metric frame, whose scale known distances set.
 
     Raises:
         DegenerateGeometryError: no distance sets the scale, or the photographs have no upward direction in common.
     """
     start, level = local_similarity(survey, model, options.up)
-    joint = adjust_jointly(survey, model, (Start(start),), estimate=options.estimate)
-    initial, warnings = _joint_product(model, points, start, joint)
-    initial = initial.model_copy(update={"cautions": union(survey.cautions, (level,))})
-    posterior = solved(survey, model, initial, options.estimate, joint)
-    return Estimated(
-        initial.model_copy(update={"geo_from_local": posterior.solution.similarity_from_local()}),
-        posterior,
-        warnings,
-    )
+    scene, near, consistency = adjust_jointly(survey, model, (Start(start),), estimate=options.estimate)
+    before = start, MeasurementVerdict(cautions=union(survey.cautions, (level,)))
+    initial, verdict, warnings = _joint_product(points, before, scene, near, consistency)
+    return solved(survey, model, initial, verdict, estimate=options.estimate, joint=(scene, near)), warnings
 
 
 def solved(
     survey: Survey,
     model: SparseModel,
-    initial: InitialSimilarity,
+    initial: SimilarityEstimate,
+    verdict: MeasurementVerdict | None = None,
+    *,
     estimate: tuple[EstimatedErrorName, ...] = (),
-    joint: JointAdjustment | None = None,
+    joint: tuple[Scene, Linearised] | None = None,
 ) -> Posterior:
     """Return the solution of a joint adjustment without the measurements that it has rejected.
 
     Without a joint adjustment, the cameras of SfM stay as they are at the similarity, with the covariance that the
-    measurements give there.
+    measurements give there. Without a verdict, all measurements are used.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
     """
-    survey, with_attitudes = initial.weighted(survey), initial.layout == "line"
+    verdict = MeasurementVerdict() if verdict is None else verdict
+    survey, with_attitudes = verdict.weighted(survey), initial.layout == "line"
     if joint is None:
         scene = initial_scene(model, survey, initial)
     else:
-        scene, near = in_own_frame(joint, survey, initial)
-    problem = problem_of(scene, initial.in_use(survey), estimate=estimate, with_attitudes=with_attitudes)
+        before, near = joint
+        scene, start = in_own_frame(before, near.state, survey, initial)
+    problem = problem_of(scene, verdict.in_use(survey), estimate=estimate, with_attitudes=with_attitudes)
     if joint is None:
         state = start_of(scene, problem)
     else:
-        state = minimise(problem, problem.start_at(near, joint.problem.errors)).state
-    return adjusted(scene, problem, state, initial, rejected_of(scene, survey, initial))
+        state = minimise(problem, problem.start_at(start, near.problem.errors)).state
+    posterior = adjusted(scene, problem, state, verdict, rejected_of(scene, survey, verdict))
+    solution = posterior.solution
+    if joint is not None:
+        initial = initial.model_copy(update={"geo_from_local": solution.similarity_from_local()})
+    return replace(posterior, solution=solution.model_copy(update={"initial": initial}))
 
 
 def _refuse(inconsistencies: tuple[Remark, ...], options: InitSim3Options) -> None:
     if inconsistencies and not options.accept_inconsistency:
         raise InconsistencyError(
             inconsistencies[0].code,
-            " ".join(caution.sentence for caution in inconsistencies)
-            + " Correct the input, or go on with larger σ: --accept-inconsistency.",
+            " ".join(caution.sentence for caution in inconsistencies),
+            remedy=" ".join(
+                (
+                    *filter(None, (caution.remedy for caution in inconsistencies)),
+                    "Correct the input, or go on with larger σ: --accept-inconsistency.",
+                )
+            ),
         )
 
 
 def _aligned_product(
     model: SparseModel, points: GeolocatedPoints, data: Correspondences, alignment: Alignment
-) -> InitialSimilarity:
+) -> SimilarityEstimate:
     solution, similarity = alignment.solution, alignment.geo_from_local
     inlier = solution.state.inlier
     agreeing = agreeing_points(model, points, similarity)
-    return InitialSimilarity(
+    return SimilarityEstimate(
         geo_from_local=_record_of(solution),
         method="robust",
         correspondences=counts_of(data.control, points.inlier),
         inliers=counts_of(data.control[inlier], agreeing),
-        gnss_outliers=tuple(name for name, bad in zip(data.name, ~inlier & ~data.control, strict=True) if bad),
         residuals={
             **residuals_of(data.part(inlier), solution.residual[inlier]),
             "points": residuals_of_points(model, points, similarity),
@@ -313,7 +324,7 @@ def _aligned_product(
 
 
 def _levelled_start(
-    survey: Survey, model: SparseModel, data: Correspondences, aligned: InitialSimilarity
+    survey: Survey, model: SparseModel, data: Correspondences, aligned: SimilarityEstimate
 ) -> Iterator[Start]:
     """Yield the start that the photographs level, where the fixes may drift and so tilt the survey."""
     if aligned.layout == "line" or not survey.drifts:
@@ -323,17 +334,11 @@ def _levelled_start(
         return
     with suppress(DegenerateGeometryError):
         similarity = levelled(level, fixes.in_local, fixes.in_geo)
-        yield Start(
-            aligned.model_copy(update={"geo_from_local": similarity.to_record("local", "geo"), "gnss_outliers": ()})
-        )
+        yield Start(aligned.model_copy(update={"geo_from_local": similarity.to_record("local", "geo")}))
 
 
-def _starts(data: Correspondences, aligned: InitialSimilarity, seed: int) -> Iterator[Start]:
-    """Yield the alignment, then, if they are needed, those of the fixes and of the control points alone.
-
-    Which fixes are outliers is for the joint adjustment to find.
-    """
-    aligned = aligned.model_copy(update={"gnss_outliers": ()})
+def _starts(data: Correspondences, aligned: SimilarityEstimate, seed: int) -> Iterator[Start]:
+    """Yield the alignment, then, if they are needed, those of the fixes and of the control points alone."""
     yield Start(aligned)
     if data.control.any():
         yield Start(aligned, at_control=True)
@@ -353,9 +358,7 @@ def _record_of(solution: AdjustedSimilarity) -> SimilarityRecord:
     return similarity.to_record("local", "geo", covariance=solution.covariance, pivot=solution.pivot)
 
 
-def _without_joint(
-    aligned: InitialSimilarity, solution: AdjustedSimilarity, cautions: tuple[Remark, ...]
-) -> InitialSimilarity:
+def _without_joint(aligned: SimilarityEstimate, solution: AdjustedSimilarity) -> SimilarityEstimate:
     """Return the alignment with σ widened by what its few residuals show."""
     count = len(solution.squared)
     free = 3.0 - 7.0 / count
@@ -363,9 +366,7 @@ def _without_joint(
     factor = component.cautious_factor if component.probability() < _LEVEL else 1.0
     record = aligned.geo_from_local
     covariance = tuple(tuple(max(factor, 1.0) * value for value in row) for row in record.covariance)
-    return aligned.model_copy(
-        update={"geo_from_local": record.model_copy(update={"covariance": covariance}), "cautions": cautions}
-    )
+    return aligned.model_copy(update={"geo_from_local": record.model_copy(update={"covariance": covariance})})
 
 
 def _of_unused(unused: tuple[UnusedControlPoint, ...]) -> tuple[Remark, ...]:
@@ -373,17 +374,22 @@ def _of_unused(unused: tuple[UnusedControlPoint, ...]) -> tuple[Remark, ...]:
 
 
 def _joint_product(
-    model: SparseModel, points: GeolocatedPoints, aligned: InitialSimilarity, joint: JointAdjustment
-) -> tuple[InitialSimilarity, tuple[Remark, ...]]:
-    """Return the result of the joint adjustment, and warnings of outliers."""
-    similarity = joint.geo_from_local
+    points: GeolocatedPoints,
+    before: tuple[SimilarityEstimate, MeasurementVerdict],
+    scene: Scene,
+    near: Linearised,
+    consistency: Consistency,
+) -> tuple[SimilarityEstimate, MeasurementVerdict, tuple[Remark, ...]]:
+    """Return similarity and verdict of the joint adjustment from those `before` it, and warnings of outliers."""
+    aligned, verdict = before
+    model, similarity = scene.sparse, scene.geo_from_local(near.state.geo_from_model)
     inliers = aligned.inliers | {"points": int(agreeing_points(model, points, similarity).sum())}
     residuals = aligned.residuals | {"points": residuals_of_points(model, points, similarity)}
-    rejected: dict[str, tuple[str, ...]] = {"gnss": aligned.gnss_outliers, "gcp": ()}
+    rejected: dict[str, tuple[str, ...]] = {"gnss": verdict.gnss_outliers, "gcp": ()}
     warnings = []
     groups = (("gnss", Fixes.kind, "fix-outliers"), ("gcp", ControlPoints.kind, "control-outliers"))
     for kind, group, code in groups:
-        names, missed, used = joint.residuals(group)
+        names, missed, used = consistency.missed(near, group)
         if not names:
             continue
         residuals[kind], inliers[kind] = residual_stats(missed[used]), int(used.sum())
@@ -393,7 +399,7 @@ def _joint_product(
             sentence = f"{len(bad)} of {len(names)} {group} are outliers, and are not used: {listed(sizes)}."
             warnings.append(Remark(code=code, sentence=sentence))
         rejected[kind] = tuple(name for name, _ in bad)
-    names, missed, used = joint.residuals(Distances.kind)
+    names, missed, used = consistency.missed(near, Distances.kind)
     sizes = [f"{name} ({float(miss[0]):+.3f} m)" for name, miss in zip(names, missed, strict=True)]
     wrong = [size for size, good in zip(sizes, used, strict=True) if not good]
     if wrong:
@@ -401,26 +407,26 @@ def _joint_product(
             f"{len(wrong)} of {len(names)} distances disagree with the others, and are not used: {listed(wrong)}."
         )
         warnings.append(Remark(code="distance-outliers", sentence=sentence))
-    elif names and np.abs(joint.problem.residuals(joint.state)[Distances.kind]).max() > _DISAGREE:
+    elif names and np.abs(near.problem.residuals(near.state)[Distances.kind]).max() > _DISAGREE:
         sentence = f"Distances miss each other or the positions by more than their σ: {listed(sizes)}."
         warnings.append(Remark(code="distances-disagree", sentence=sentence))
     pivot = np.array(aligned.geo_from_local.pivot)
-    return aligned.model_copy(
+    record = similarity.to_record("local", "geo", pivot=pivot)
+    initial = aligned.model_copy(update={"geo_from_local": record, "inliers": inliers, "residuals": residuals})
+    verdict = verdict.model_copy(
         update={
-            "geo_from_local": similarity.to_record("local", "geo", pivot=pivot),
-            "inliers": inliers,
             "gnss_outliers": rejected["gnss"],
-            "control_outliers": aligned.control_outliers + rejected["gcp"],
+            "control_outliers": verdict.control_outliers + rejected["gcp"],
             "distance_outliers": tuple(name for name, good in zip(names, used, strict=True) if not good),
-            "residuals": residuals,
-            "variance_factors": tuple(joint.factors.values()),
-            "tied": joint.problem.earlier is not None,
-            "common_outliers": outliers_in_common(joint),
+            "variance_factors": tuple(consistency.factors.values()),
+            "tied": near.problem.earlier is not None,
+            "common_outliers": outliers_in_common(near, consistency),
         }
-    ), tuple(warnings)
+    )
+    return initial, verdict, tuple(warnings)
 
 
-def similarity_by_paper(model: SparseModel, points: GeolocatedPoints, data: Correspondences) -> InitialSimilarity:
+def similarity_by_paper(model: SparseModel, points: GeolocatedPoints, data: Correspondences) -> SimilarityEstimate:
     """Return the paper's similarity (eqs 16–21) of the intersected points, with equal weights.
 
     The paper gives no covariance. Here the covariance follows from the scatter of the points, counted as only one
@@ -433,7 +439,8 @@ def similarity_by_paper(model: SparseModel, points: GeolocatedPoints, data: Corr
     if good.sum() < 3:
         raise DegenerateGeometryError(
             "too-few-intersected-points",
-            f"--method paper needs at least three intersected points; there are {good.sum()}. Use --method robust.",
+            f"--method paper needs at least three intersected points; there are {good.sum()}.",
+            remedy="Use --method robust.",
         )
     local, geo = model.point_in_local[good], points.position_in_geo[good]
     similarity = spread_ratio_similarity(local, geo)
@@ -443,7 +450,7 @@ def similarity_by_paper(model: SparseModel, points: GeolocatedPoints, data: Corr
     unit = np.ones(7)
     unit[:4] = ((mapped - pivot) ** 2).sum(axis=1).mean() ** -0.5
     covariance = covariance_of(jacobian_at(mapped, pivot).reshape(-1, 7), unit)
-    return InitialSimilarity(
+    return SimilarityEstimate(
         geo_from_local=similarity.to_record("local", "geo", covariance=variance * covariance, pivot=pivot),
         method="paper",
         correspondences=counts_of(data.control[:0], good),
@@ -472,6 +479,7 @@ def agreeing_points(model: SparseModel, points: GeolocatedPoints, similarity: Si
 
 
 def residuals_of_points(model: SparseModel, points: GeolocatedPoints, similarity: Similarity) -> ResidualStats:
+    """Return the statistics of the inliers among located points, minus the SfM points in `geo`, in metres."""
     good = points.inlier
     return residual_stats(points.position_in_geo[good] - similarity.apply(model.point_in_local[good]))
 

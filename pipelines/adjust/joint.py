@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +30,7 @@ from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import chi2_probability_above, median_chi2, outlier_gate
-from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.adjustment import SimilarityEstimate
 from pipelines.survey.marks import RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.survey.report_parts import (
     EstimatedError,
@@ -62,100 +63,92 @@ _NO_REDUNDANCY = 0.5
 
 
 @dataclass(frozen=True)
-class JointAdjustment:
-    """Solution, and what the measurements say of each other."""
+class Consistency:
+    """What the measurements of an adjustment say of each other at its minimum."""
 
-    survey: Survey  # with the variance factors in its covariances
-    scene: Scene
-    problem: Problem
-    state: State
-    normal: NormalMatrix  # equations at `state`, the minimum of `problem`, which has all measurements
-    at_stated: dict[str, VarianceComponent]  # tests of fixes and control points by kind, under the stated σ
-    components: dict[str, VarianceComponent]  # the same under the applied factors
+    used: dict[str, BoolArray]  # by kind of observation: mask (M,) of those that agree
     factors: dict[Group, VarianceFactor]
-    cost: float  # −2 ln likelihood at the stated σ; compares solutions from different starts
-
-    @property
-    def is_consistent(self) -> bool:
-        """Whether fixes and control points agree with each other at the stated σ, but for a few outlying fixes."""
-        fixes, control = (self.at_stated.get(kind) for kind in (Fixes.kind, ControlPoints.kind))
-        of_fixes = fixes is None or (fixes.agree and float(fixes.used.mean()) >= 1.0 - _FEW_OUTLIERS)
-        return of_fixes and (control is None or (control.agree and bool(control.used.all())))
-
-    @property
-    def geo_from_local(self) -> Similarity:
-        return self.state.geo_from_model @ self.scene.model_from_local
+    estimates: tuple[EstimatedError, ...]  # of the systematic errors
 
     @property
     def biases(self) -> tuple[EstimatedError, ...]:
         """Common errors of the fixes, by session."""
-        errors = self.problem.errors
-        covariance = self.normal.of_errors(len(self.problem.lens), len(errors))
-        estimates = errors.estimates(self.state.errors, covariance)
-        return tuple(estimate for estimate in estimates if estimate.name == "bias")
+        return tuple(estimate for estimate in self.estimates if estimate.name == "bias")
 
-    def residuals(self, kind: str) -> tuple[tuple[str, ...], FloatArray, BoolArray]:
+    def weighted(self, survey: Survey) -> Survey:
+        """Return a survey with the variance factors in its covariances."""
+        return with_variance_factors(survey, applied_factors(tuple(self.factors.values())))
+
+    def missed(self, near: Linearised, kind: str) -> tuple[tuple[str, ...], FloatArray, BoolArray]:
         """Return names, residuals (M, d) in metres, measured minus predicted, and the mask (M,) of the inliers."""
-        term = self.problem.term(kind)
+        term = near.problem.term(kind)
         if not isinstance(term, (Fixes, ControlPoints, Distances, EarlierPoints)):
             return (), np.empty((0, 3)), np.empty(0, dtype=bool)
-        return term.name, -term.residuals(self.problem.at(self.state)), self.components[kind].used
+        return term.name, -term.residuals(near.problem.at(near.state)), self.used[kind]
 
 
 @dataclass(frozen=True)
 class Start:
     """Similarity to start from, and whether the control points set it, so that common errors take the rest."""
 
-    initial: InitialSimilarity
+    initial: SimilarityEstimate
     at_control: bool = False
 
 
 def adjust_jointly(
     survey: Survey, model: SparseModel, starts: Iterable[Start], *, estimate: tuple[EstimatedErrorName, ...] = ()
-) -> JointAdjustment:
-    """Return the adjustment from the first start, or the likeliest of several where the first finds disagreement.
+) -> tuple[Scene, Linearised, Consistency]:
+    """Return the minimum from the first start, or the likeliest of several where the first finds disagreement.
 
-    A layout on a line takes the attitudes into the adjustment.
+    The scene is that of the start. The problem at its minimum has all measurements, with the variance factors. A
+    layout on a line takes the attitudes into the adjustment.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open, from every start.
         InputError: an error is to be estimated whose measurements were not recorded.
     """
-    solutions: list[JointAdjustment] = []
+    found: list[_Found] = []
     refusal = DegenerateGeometryError("no-start", "The joint adjustment has no start.")
     frame: Scene | None = None
     for start in starts:
         try:
             frame = initial_scene(model, survey, start.initial) if frame is None else frame
-            solutions.append(_adjust(survey, frame, start, estimate))
-            if solutions[0].is_consistent:
+            found.append(_adjust(survey, frame, start, estimate))
+            if found[0].consistent:
                 break
         except (DegenerateGeometryError, ConvergenceError) as error:
-            refusal = DegenerateGeometryError(error.code, str(error))
-    if not solutions:
+            refusal = DegenerateGeometryError(error.code, error.fault, remedy=error.remedy)
+    if frame is None or not found:
         raise refusal
-    return min(solutions, key=lambda solution: solution.cost)
+    best = min(found, key=lambda one: one.cost)
+    return frame, best.near, best.consistency
 
 
-def in_own_frame(joint: JointAdjustment, survey: Survey, initial: InitialSimilarity) -> tuple[Scene, State]:
+def in_own_frame(before: Scene, state: State, survey: Survey, initial: SimilarityEstimate) -> tuple[Scene, State]:
     """Return scene and state in the frame `model` of the solution: axes and metre of geo, as training takes them.
 
-    The joint adjustment was solved in the frame of its start; `survey` has the split into training and test images.
+    The state was solved in the scene of its start; `survey` has the split into training and test images.
     """
-    before, state = joint.scene, joint.state
     scene = initial_scene(before.sparse, survey, initial)
     new_from_old = scene.model_from_local @ before.model_from_local.inverse()
     turn = new_from_old.rotation
     corrections = np.concatenate(
         [state.correction[:, :3] @ turn.T, new_from_old.scale * state.correction[:, 3:] @ turn.T], axis=1
     )
-    scene = scene.with_bundle(before.bundle.turned(new_from_old, scene.poses.cam_center_in_model))
+    scene = replace(scene, known_bundle=before.bundle.turned(new_from_old, scene.poses.cam_center_in_model))
     return scene, State(scene.geo_from_model, corrections, state.lens, state.errors)
 
 
-def _adjust(
-    survey: Survey, scene: Scene, start: Start, estimate: tuple[EstimatedErrorName, ...]
-) -> JointAdjustment:
+class _Found(NamedTuple):
+    """Minimum from one start."""
+
+    near: Linearised
+    consistency: Consistency
+    consistent: bool  # but for a few outlying fixes, at the stated σ
+    cost: float  # −2 ln likelihood at the stated σ; compares solutions from different starts
+
+
+def _adjust(survey: Survey, scene: Scene, start: Start, estimate: tuple[EstimatedErrorName, ...]) -> _Found:
     """Alternate between the solution and the variance factors, from the stated σ."""
     fixed = {
         factor.group: factor for factor in (*_marks(survey, scene), *_attitudes(survey, scene.sparse), _ties(scene))
@@ -177,8 +170,9 @@ def _adjust(
         state = onto_control(problem, state)
     minimum = minimise(problem, state)
     cost = minimum.cost
-    at_stated, normal = variance_components(linearised(problem, minimum.state))
-    components = at_stated
+    near = linearised(problem, minimum.state)
+    components, normal = variance_components(near)
+    consistent = _agree(components)
     for _ in range(_ROUNDS):
         before, applied = applied, applied | _next_factors(survey, components, applied)
         applied |= _of_common_errors(survey, problem, minimum.state, applied)
@@ -187,7 +181,8 @@ def _adjust(
             break
         problem = problem_at(applied)
         minimum = minimise(problem, minimum.state, None if max(changes) > _NEAR else normal)
-        components, normal = variance_components(linearised(problem, minimum.state))
+        near = linearised(problem, minimum.state)
+        components, normal = variance_components(near)
     factors = (
         {
             group: _factor(survey, group, components[group], applied.get(group, 1.0))
@@ -197,8 +192,17 @@ def _adjust(
         | fixed
         | _stated_common_errors(survey, applied)
     )
-    weighted = with_variance_factors(survey, applied)
-    return JointAdjustment(weighted, scene, problem, minimum.state, normal, at_stated, components, factors, cost)
+    errors = problem.errors
+    estimates = errors.estimates(minimum.state.errors, normal.of_errors(len(problem.lens), len(errors)))
+    used = {kind: component.used for kind, component in components.items()}
+    return _Found(near, Consistency(used, factors, estimates), consistent, cost)
+
+
+def _agree(components: dict[str, VarianceComponent]) -> bool:
+    """Return whether fixes and control points agree with each other, but for a few outlying fixes."""
+    fixes, control = (components.get(kind) for kind in (Fixes.kind, ControlPoints.kind))
+    of_fixes = fixes is None or (fixes.agree and float(fixes.used.mean()) >= 1.0 - _FEW_OUTLIERS)
+    return of_fixes and (control is None or (control.agree and bool(control.used.all())))
 
 
 def _next_factors(

@@ -60,14 +60,16 @@ def _apart(camera: str, prior: CameraPrior, solved: Camera) -> Remark:
         return Remark(
             code=_NO_LENS,
             sentence=sentence + "No lens is so far off: the SfM model is bent, most likely because too few "
-            "photographs overlap, or the tags belong to another size. Leave out photographs that connect to few "
-            "others, add photographs, or state the focal length with --focal-px.",
+            "photographs overlap, or the tags belong to another size.",
+            remedy="Leave out photographs that connect to few others, add photographs, or state the focal length "
+            "with --focal-px.",
         )
     return Remark(
         code="focal-length-differs",
         sentence=sentence + "Tags are rounded, or of a crop, and then the solved one is right; or the photographs "
         "do not determine it, and then the ground may be wrong by as large a share of the flying height. Control "
-        "or check points tell which. --focal-px states a focal length that is known.",
+        "or check points tell which.",
+        remedy="--focal-px states a focal length that is known.",
     )
 
 
@@ -109,7 +111,8 @@ def rolling_shutter_of(
     caution = Remark(
         code="rolling-shutter-unstated",
         sentence=f"The last row of a photograph moves by {last_row_px:.1f} px along the flight, {told_as}. "
-        f"That bends the SfM model. The predicted σ contain what the photographs tell of it, not all. {remedy}",
+        f"That bends the SfM model. The predicted σ contain what the photographs tell of it, not all.",
+        remedy=remedy,
     )
     return (caution,)
 

@@ -23,7 +23,7 @@ from pipelines.core.types import FloatArray
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import residual_stats
-from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.adjustment import SimilarityEstimate
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.survey import Survey
 
@@ -31,7 +31,7 @@ Up = Literal["plane", "photographs"]
 _LEAST_UP = 0.1  # length of a mean of unit vectors, below which they have no common direction
 
 
-def local_similarity(survey: Survey, model: SparseModel, up: Up) -> tuple[InitialSimilarity, Remark]:
+def local_similarity(survey: Survey, model: SparseModel, up: Up) -> tuple[SimilarityEstimate, Remark]:
     """Return the start of the adjustment in a local metric frame, and what is assumed of that frame.
 
     Raises:
@@ -39,11 +39,11 @@ def local_similarity(survey: Survey, model: SparseModel, up: Up) -> tuple[Initia
             photographs have no upward direction in common.
     """
     scale = _scale(survey, model)
-    rotation, source = _level(survey, model, up)
+    rotation, source, remedy = _level(survey, model, up)
     center = model.cam_center_in_local.mean(axis=0)
     similarity = Similarity(scale, rotation, -scale * rotation @ center)
     none = residual_stats(np.zeros((0, 3)))
-    initial = InitialSimilarity(
+    initial = SimilarityEstimate(
         geo_from_local=similarity.to_record("local", "geo"),
         method="robust",
         correspondences={"gnss": 0, "gcp": 0, "points": 0},
@@ -57,7 +57,7 @@ def local_similarity(survey: Survey, model: SparseModel, up: Up) -> tuple[Initia
         f"The local frame has the middle of the cameras as its origin, and its vertical is {source} σ of the "
         "result are those of the shape and the scale in this frame."
     )
-    return initial, Remark(code="local-frame-level", sentence=sentence)
+    return initial, Remark(code="local-frame-level", sentence=sentence, remedy=remedy)
 
 
 def _scale(survey: Survey, model: SparseModel) -> float:
@@ -73,21 +73,24 @@ def _scale(survey: Survey, model: SparseModel) -> float:
         names = listed([distance.name for distance in wanted])
         raise DegenerateGeometryError(
             "no-scale",
-            f"No known distance has two ends that registered photographs determine ({names}), and nothing else "
-            "sets the scale. Mark the ends in more photographs, or give positions or control points to "
-            "`georef ingest`.",
+            (
+                f"No known distance has two ends that registered photographs determine ({names}), and nothing "
+                "else sets the scale."
+            ),
+            remedy="Mark the ends in more photographs, or give positions or control points to `georef ingest`.",
         )
     measured = np.array([distance.distance_m for distance in wanted])
     return float(np.median(measured[known] / length[known]))
 
 
-def _level(survey: Survey, model: SparseModel, up: Up) -> tuple[FloatArray, str]:
-    """Return the rotation (3, 3) geo ← local, and where its vertical comes from."""
+def _level(survey: Survey, model: SparseModel, up: Up) -> tuple[FloatArray, str, str]:
+    """Return the rotation (3, 3) geo ← local, where its vertical comes from, and what to type for another."""
     recorded = attitude_prior(survey, model)
     if recorded is not None:
-        return recorded.rotation, "that of the recorded attitudes."
+        return recorded.rotation, "that of the recorded attitudes.", ""
     rotation, center = model.rotation_cam_from_local, model.cam_center_in_local
     upward = -(rotation[:, 1] + rotation[:, 2]).mean(axis=0)  # upward in the photographs, and against their views
+    remedy = ""
     if up == "photographs":
         vertical, source = (
             -rotation[:, 1].mean(axis=0),
@@ -98,7 +101,8 @@ def _level(survey: Survey, model: SparseModel, up: Up) -> tuple[FloatArray, str]
         spread = across.T @ across / len(across) + away.T @ away / max(float((away**2).sum()), 1e-300)
         vertical = np.linalg.eigh(spread)[1][:, 0]
         vertical = vertical * np.where(vertical @ upward < 0, -1.0, 1.0)
-        source = "assumed to be square to the plane of the cameras. For a facade, give --up photographs."
+        source = "assumed to be square to the plane of the cameras."
+        remedy = "For a facade, give --up photographs."
     length = float(np.linalg.norm(vertical))
     if length < _LEAST_UP:
         raise DegenerateGeometryError(
@@ -112,4 +116,4 @@ def _level(survey: Survey, model: SparseModel, up: Up) -> tuple[FloatArray, str]
     if np.linalg.norm(along) < _LEAST_UP:
         along = np.cross(vertical, np.eye(3)[np.argmin(np.abs(vertical))])
     along = along / np.linalg.norm(along)
-    return np.stack([along, np.cross(vertical, along), vertical]), source
+    return np.stack([along, np.cross(vertical, along), vertical]), source, remedy

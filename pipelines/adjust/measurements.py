@@ -30,21 +30,21 @@ from pipelines.adjust.terms import (
     LocalFrame,
     Planes,
     Term,
-    root_information,
 )
 from pipelines.core.errors import InputError
 from pipelines.core.sentences import listed
 from pipelines.core.types import BoolArray, FloatArray, IntArray, Vector3, rows_of, vector3
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.cameras import bearings
+from pipelines.geometry.intersection import NearestPoints
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.adjustment import MeasurementVerdict
 from pipelines.survey.common_points import CommonPoints
 from pipelines.survey.marks import MarkRays, RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.survey.scene import Scene
+from pipelines.survey.solution import EarlierDate
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_model import EarlierDate
 
 _INCONSISTENT_SIGMAS = 6.0
 _INCONSISTENT_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic
@@ -254,7 +254,7 @@ def problem_of(
     if attitudes is not None:
         if "boresight" in wanted:
             blocks.append(SystematicError("boresight", (SIGMA_BORESIGHT_RAD,) * 3))
-        sigma = float(np.median(1.0 / attitudes.root_information[:, 0, 0]))
+        sigma = float(np.median(np.sqrt(attitudes.cov[:, 0, 0])))
         blocks.append(SystematicError("common", (sigma,) * 3))
     if planes is not None:
         blocks.append(SystematicError("lidar-shift", (SIGMA_LIDAR_M,) * 3))
@@ -275,9 +275,9 @@ def problem_of(
     return Problem(scene.poses, scene.bundle, measured, errors, sigma_datum_m=datum, earlier=date)
 
 
-def rejected_of(scene: Scene, survey: Survey, initial: InitialSimilarity) -> Problem | None:
+def rejected_of(scene: Scene, survey: Survey, verdict: MeasurementVerdict) -> Problem | None:
     """Return the problem of the measurements that `init-sim3` has rejected; None if there are none."""
-    rejected = initial.rejected(survey)
+    rejected = verdict.rejected(survey)
     return None if rejected is None else problem_of(scene, rejected)
 
 
@@ -291,7 +291,7 @@ def fixes_of(scene: Scene, survey: Survey) -> Fixes | None:
         name=fixes.name,
         camera=np.array([index[name] for name in fixes.name]),
         position_in_geo=fixes.in_geo,
-        root_information=root_information(fixes.cov_in_geo),
+        cov=fixes.cov_in_geo,
         session=np.array([session[name] for name in fixes.name]),
         drift=_drift_of(survey, fixes.name),
     )
@@ -322,7 +322,7 @@ def level_term(scene: Scene, survey: Survey) -> Level | None:
     turn = scene.model_from_local.rotation
     axes = np.linalg.svd(level.up_in_local[None])[2][1:]
     covariance = axes @ level.cov_rad2 @ axes.T
-    return Level((turn @ level.up_in_local)[None], (axes @ turn.T)[None], root_information(covariance[None]))
+    return Level((turn @ level.up_in_local)[None], (axes @ turn.T)[None], covariance[None])
 
 
 def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
@@ -339,7 +339,7 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
         name=rays.point_name,
         **_of_rays(scene, rays),
         position_in_geo=position,
-        root_information=root_information(of_survey + _mark_covariance(scene, rays, position)),
+        cov=of_survey + _mark_covariance(scene, rays, position),
     )
 
 
@@ -370,7 +370,7 @@ def earlier_of(scene: Scene, survey: Survey) -> EarlierPoints | None:
         name=rays.point_name,
         **_of_rays(scene, rays),
         position_in_geo=position,
-        root_information=root_information(common.cov_in_geo(survey.origin_on_earth)[index] + own),
+        cov=common.cov_in_geo(survey.origin_on_earth)[index] + own,
     )
 
 
@@ -424,7 +424,7 @@ def distances_of(scene: Scene, survey: Survey) -> Distances | None:
         name=tuple(distance.name for distance in wanted),
         **_of_rays(scene, rays),
         distance_m=np.array([distance.distance_m for distance in wanted]),
-        root_information=np.ones((len(wanted), 1, 1)),
+        cov=np.ones((len(wanted), 1, 1)),
     )
     sfm = At(
         scene.poses.cam_from_model,
@@ -440,7 +440,7 @@ def distances_of(scene: Scene, survey: Survey) -> Distances | None:
     of_marks = _mark_covariance(scene, rays, place).reshape(-1, 2, 3, 3).sum(axis=1)
     variance = np.einsum("di,dij,dj->d", along, of_marks, along)
     variance += np.array([distance.sigma_m for distance in wanted]) ** 2
-    return replace(exact, root_information=variance[:, None, None] ** -0.5)
+    return replace(exact, cov=variance[:, None, None])
 
 
 def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:
@@ -452,7 +452,7 @@ def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:
         name=tuple(scene.sparse.image_name[image] for image in recorded.image),
         camera=recorded.image,
         geo_from_cam=recorded.geo_from_cam,
-        root_information=np.eye(3) / recorded.sigma_rad[:, None, None],
+        cov=np.square(recorded.sigma_rad)[:, None, None] * np.eye(3),
     )
 
 
@@ -514,9 +514,4 @@ def _mark_covariance(scene: Scene, marks: MarkRays, position: FloatArray) -> Flo
     poses = scene.poses
     center = scene.geo_from_model.apply(poses.cam_center_in_model[marks.camera])
     direction = np.einsum("kji,kj->ki", poses.cam_from_model[marks.camera], marks.bearing_in_cam)
-    distance = np.linalg.norm(position[marks.point] - center, axis=1)
-    weight = 1.0 / (marks.sigma_rad * distance) ** 2
-    projector = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    normal = np.zeros((len(position), 3, 3))
-    np.add.at(normal, marks.point, weight[:, None, None] * projector)
-    return np.asarray(np.linalg.inv(normal))
+    return NearestPoints(position, marks.point, center, direction, marks.sigma_rad).cov

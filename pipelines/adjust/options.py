@@ -19,7 +19,22 @@ EstimatedErrorNames = Annotated[
 
 
 class CalibrateOptions(StageOptions):
-    """Options of the calibration of the rig: parameters to estimate, and parameters to apply."""
+    """Options of the calibration of the rig: parameters to estimate, and parameters to apply.
+
+    After sfm, the track of the cameras is fitted to the navigation that ingest recorded from a bag or a trajectory
+    by time. Each parameter is stated with its σ. A parameter that the flight does not determine is reported as not
+    observable, and is not applied. Parameters requested in ingest (--time-offset auto, --estimate) are applied to
+    the positions and attitudes of later stages; other parameters only with --apply. The survey itself stays as
+    recorded.
+
+    Positions by photograph, of EXIF or a table with image names, are tested for a lag against the exposures, which
+    is applied where lines in two directions show it; --no-apply leaves them as they are.
+
+    Examples:
+      georef calibrate flight
+      georef calibrate flight --estimate time-offset --max-offset 5
+      georef calibrate flight --estimate time-offset,boresight,lever-arm --apply
+    """
 
     estimate: RigParameters | None = Field(
         None,
@@ -36,7 +51,14 @@ class CalibrateOptions(StageOptions):
 
 
 class GeolocateOptions(StageOptions):
-    """Options of the forward intersection of every SfM point in the frame `geo`."""
+    """Options of the forward intersection of every SfM point in the frame `geo`.
+
+    Each point gets its own position, covariance, number of rays and intersection angle.
+
+    Examples:
+      georef geolocate flight
+      georef geolocate flight --attitude sfm --min-angle 2
+    """
 
     attitude: Literal["auto", "recorded", "sfm"] = Field(
         "auto", description="Rotations of the rays: recorded with the images, or SfM's aligned to geo."
@@ -49,7 +71,16 @@ class GeolocateOptions(StageOptions):
 
 
 class InitSim3Options(StageOptions):
-    """Options of the similarity from the SfM model into the frame `geo`."""
+    """Options of the similarity from the SfM model into the frame `geo`.
+
+    The default is robust and weighted by the covariances of the measurements; --method paper is the plain
+    least-squares estimate.
+
+    Examples:
+      georef init-sim3 flight
+      georef init-sim3 flight --method paper
+      georef init-sim3 flight --max-residual 5
+    """
 
     method: Literal["robust", "paper"] = Field(
         "robust", description="robust: RANSAC and weights from covariances; paper: plain least squares."

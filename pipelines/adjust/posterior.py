@@ -18,55 +18,12 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import read_npz
 from pipelines.core.products import save_npz
 from pipelines.core.types import FloatArray, IntArray, rows_of
-from pipelines.geometry.network import (
-    Network,
-    has_positive_depth,
-    lens_slots,
-    linearise_bundle,
-    with_positive_depths,
-)
+from pipelines.geometry.intersection import IntersectionJacobian, intersection_jacobian
 from pipelines.geometry.similarity import covariance_at, jacobian_at, moved_pivot, second_moment_at
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.marks import MarkRays
 from pipelines.survey.scene import network_of
-from pipelines.survey.trained_model import Adjustment, EarlierDate
-
-
-@dataclass(frozen=True)
-class IntersectionJacobian:
-    """Effect of poses, lens and marks on N intersected points, to first order."""
-
-    # (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in `geometry.bundle.CorrectionBasis`
-    by_poses: csr_matrix
-    by_lens: FloatArray  # (N, 3, L) metres by the lens parameters, in the order of `CorrectionBasis`
-    # (N, 3, 3) m², from the σ of the marks; NaN for a point that its rays do not determine
-    cov_of_marks: FloatArray
-
-
-def intersection_jacobian(
-    marks: Network, sigma_px: FloatArray, surveyed: FloatArray | None = None
-) -> IntersectionJacobian:
-    """Return the derivatives by poses and lens of the points of a network, each intersected from its own marks.
-
-    The derivatives are taken at the projections of the points; of the marks their σ (M,) enter, and not the pixels.
-    Marks of points behind their camera do not count. Points may have information (N, 3, 3) beyond these, in 1/m².
-    """
-    sigma_px, marks = sigma_px[has_positive_depth(marks)], with_positive_depths(marks)
-    lin, count = linearise_bundle(marks), len(marks.point_in_world)
-    weighted = np.swapaxes(lin.jacobian_point, 1, 2) / (sigma_px**2)[:, None, None]
-    normal = np.zeros((count, 3, 3)) if surveyed is None else surveyed.copy()
-    np.add.at(normal, marks.obs_point, weighted @ lin.jacobian_point)
-    value, vector = np.linalg.eigh(normal)
-    value[value[:, 0] <= 1e-9 * value[:, 2]] = np.nan
-    cov = (vector / value[:, None, :]) @ np.swapaxes(vector, 1, 2)
-    response = -cov[marks.obs_point] @ weighted  # (M, 3, 2) metres per pixel
-    lens = np.zeros((count, len(marks.cameras), 3, lin.jacobian_intrinsics.shape[2]))
-    np.add.at(lens, (marks.obs_point, lens_slots(marks)), response @ lin.jacobian_intrinsics)
-    order = np.argsort(marks.obs_point, kind="stable")
-    first = np.searchsorted(marks.obs_point[order], np.arange(count + 1))
-    blocks = ((response @ lin.jacobian_pose)[order], marks.obs_image[order], first)
-    poses = bsr_matrix(blocks, shape=(3 * count, 6 * len(marks.camera_id)))
-    return IntersectionJacobian(csr_matrix(poses), np.swapaxes(lens, 1, 2).reshape(count, 3, -1), cov)
+from pipelines.survey.solution import EarlierDate, Solution
 
 
 @dataclass(frozen=True)
@@ -85,7 +42,7 @@ class CommonRows:
 class Posterior:
     """Covariances of a solved survey."""
 
-    solution: Adjustment
+    solution: Solution
     sparse: SparseModel  # with the solved lenses
     normal: NormalMatrix  # in `model`
     followed: FloatArray  # (7, 6 n + L) mean similarity of the SfM points by corrections of cameras and lens
@@ -319,14 +276,21 @@ def save_posterior(posterior: Posterior, path: Path) -> None:
     save_npz(path, dict(zip(_ARRAYS, arrays, strict=True)) | of_grid | of_common)
 
 
-def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Posterior:
+def load_posterior(path: Path, solution: Solution, sfm: SparseModel) -> Posterior:
     """Read what `save_posterior` has written; `sfm` has SfM's lenses.
 
     Raises:
-        InputError: the file is damaged, or of another solution.
+        InputError: the file is damaged, of another solution, or stale: an older version has written it.
     """
     of_common = _COMMON if solution.earlier is not None else ()
-    arrays, n = read_npz(path, (*_ARRAYS, *AccuracyGrid.NO_ARRAYS, *of_common)), len(solution.cameras)
+    try:
+        arrays, n = read_npz(path, (*_ARRAYS, *AccuracyGrid.NO_ARRAYS, *of_common)), len(solution.cameras)
+    except InputError as error:
+        if error.code != "array-missing":
+            raise
+        message = "is stale: an older version of GeoRefGS has solved this survey, without all covariances."
+        remedy = "Run `georef init-sim3` (and `georef train`) again."
+        raise InputError("posterior-of-older-version", message, path=path, remedy=remedy) from error
     border, corner, position, followed, lens, camera_cov = (arrays[name] for name in _ARRAYS[3:])
     known, width = len(followed[0]) - 6 * n if followed.ndim == 2 else -1, len(corner)
     fits = (
@@ -346,8 +310,9 @@ def load_posterior(path: Path, solution: Adjustment, sfm: SparseModel) -> Poster
     if not fits:
         raise InputError(
             "posterior-of-another-solution",
-            "does not belong to the solution beside it. Run `georef init-sim3` (and `georef train`) again.",
+            "does not belong to the solution beside it.",
             path=path,
+            remedy="Run `georef init-sim3` (and `georef train`) again.",
         )
     poses = bsr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=(6 * n, 6 * n))
     normal, sparse = NormalMatrix(poses, border, corner, position), solution.with_lenses(sfm)

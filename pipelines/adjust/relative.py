@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid, accuracy_grid, seen_by
 from pipelines.adjust.posterior import CommonRows, Posterior
+from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_enu_rotation, enu_from_ecef, lla_of
 from pipelines.geometry.intersection import refined_points
@@ -105,9 +106,18 @@ class Relative:
 
 
 def relative(later: Solved, earlier: Solved, common: CommonPoints) -> Relative:
-    """Return what two dates know of each other; the solutions are those that `common` ties."""
+    """Return what two dates know of each other; the solutions are those that `common` ties.
+
+    Raises:
+        InputError: a date is stale, as its points are no longer those that were solved.
+    """
     tied = later.posterior.common
     assert tied is not None
+    ids = ((tied.point_id, common.point_id), (common.earlier_point_id, earlier.posterior.sparse.point_id))
+    if not all(np.isin(*pair).all() for pair in ids):
+        message = "The points in common are not those of the solutions: a date is stale, `sfm` ran again since."
+        remedy = "Run `georef run` of the later date again."
+        raise InputError("common-points-stale", message, remedy=remedy)
     known = np.isin(common.point_id, later.posterior.sparse.point_id)
     place, *_ = later.tracks(common.point_id[known])
     missed = place - common.position_in_geo(later.origin)[known]

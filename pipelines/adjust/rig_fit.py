@@ -23,23 +23,28 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from pipelines.adjust.alignment import Correspondences, covariance_of
+from pipelines.adjust.state import SIGMA_ARM_M, SIGMA_BORESIGHT_RAD
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, perturbation, umeyama
-from pipelines.geometry.statistics import cauchy_weight, mad_sigma, median_chi2, squared_mahalanobis
+from pipelines.geometry.statistics import (
+    cauchy_weight,
+    mad_sigma,
+    median_chi2,
+    root_information,
+    squared_mahalanobis,
+)
 from pipelines.geometry.trajectory import Trajectory
 
 # Columns of the parameters: similarity (ln s, rotation, translation), offset in s, boresight in rad, arm in m.
 SIMILARITY, OFFSET, BORESIGHT, ARM = slice(0, 7), slice(7, 8), slice(8, 11), slice(11, 14)
-# A parameter counts as observed if its σ is below this: seconds, degrees, metres.
-LIMIT_OFFSET_S, LIMIT_BORESIGHT_DEG, LIMIT_ARM_M = 0.05, 0.5, 0.1
+LIMIT_OFFSET_S = 0.05  # σ of a time offset that counts as observed; of the others, see `adjust.state.is_observed`
 # Steps on either side of a state that give the derivatives. That of the time offset measures velocities: between
 # neighbouring fixes noise would dominate.
 _DIFFERENCE_S = 0.5
 _DIFFERENCES = np.where(np.arange(14) == OFFSET.start, _DIFFERENCE_S, 1e-5)
 _SMOOTHING_S = 0.1
-_PRIOR_BORESIGHT_RAD, _PRIOR_ARM_M = np.radians(10.0), 2.0
 _ROUNDS, _STEPS = 4, 12
 _SCAN_STEP_S = 0.1
 _INNER = 0.9  # part of the search whose end is no answer: beyond, the best may be the edge of a better one
@@ -148,7 +153,8 @@ def fit_rig(data: RigData, start_offset_s: float, start_boresight: FloatArray, o
         raise DegenerateGeometryError(
             "time-offset-at-limit",
             f"The best time offset lies at the limit of the search, {options.max_offset_s:g} s from the present "
-            f"one; a larger offset may fit better. Search further with --max-offset {_FURTHER_S:g}.",
+            f"one; a larger offset may fit better.",
+            remedy=f"Search further with --max-offset {_FURTHER_S:g}.",
         )
     _, jacobian, _ = _linearised(data, state, (sigma_m, sigma_rad), start, options)
     sigma = np.where(free, np.sqrt(np.diag(_covariance(jacobian, free))), np.inf)
@@ -270,7 +276,7 @@ def _linearised(
     used = _usable_images(data, state.offset_s)
     pivot = state.geo_from_local.apply(data.center_in_local[used]).mean(axis=0)
     sigma, moved = np.full(14, np.inf), np.zeros(14)
-    sigma[OFFSET], sigma[BORESIGHT], sigma[ARM] = options.max_offset_s, _PRIOR_BORESIGHT_RAD, _PRIOR_ARM_M
+    sigma[OFFSET], sigma[BORESIGHT], sigma[ARM] = options.max_offset_s, SIGMA_BORESIGHT_RAD, SIGMA_ARM_M
     moved[OFFSET] = state.offset_s - start.offset_s
     moved[BORESIGHT] = log_so3(start.boresight.T @ state.boresight)
     moved[ARM] = state.arm - start.arm
@@ -307,4 +313,4 @@ def _control_whitener(data: RigData, state: RigState, missed: FloatArray) -> Flo
     cov = data.control.cov_in_geo + turn @ data.control.cov_in_local @ turn.T
     squared = squared_mahalanobis(missed, cov)
     excess = max(1.0, float(np.median(squared)) / median_chi2(3)) if len(squared) else 1.0
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(excess * cov)))
+    return root_information(excess * cov)

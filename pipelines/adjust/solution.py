@@ -18,14 +18,14 @@ from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.adjustment import MeasurementVerdict
 from pipelines.survey.report import AccuracySummary
 from pipelines.survey.scene import Scene
-from pipelines.survey.trained_model import (
-    Adjustment,
+from pipelines.survey.solution import (
     Measurement,
-    TrainedCamera,
-    TrainedLens,
+    Solution,
+    SolvedCamera,
+    SolvedLens,
     TrainedModel,
 )
 
@@ -35,12 +35,11 @@ _REJECTED = "is inconsistent with the others at the 99.9 % level"
 
 
 def adjusted(
-    scene: Scene, problem: Problem, state: State, initial: InitialSimilarity, rejected: Problem | None = None
+    scene: Scene, problem: Problem, state: State, verdict: MeasurementVerdict, rejected: Problem | None = None
 ) -> Posterior:
     """Return a state as the solution of a survey, with its covariances.
 
-    `problem` has the measurements in use. The verdict of `initial` on each measurement stands, and its factors and
-    cautions are carried on.
+    `problem` has the measurements in use. The verdict on each measurement stands, with its factors and cautions.
 
     Raises:
         DegenerateGeometryError: the measurements leave the similarity open.
@@ -51,23 +50,20 @@ def adjusted(
     poses = state.poses(scene.poses)
     pivot = similarity.apply(poses.cam_center_in_model).mean(axis=0)
     covariance = normal.of_errors(len(problem.lens), len(problem.errors))
-    solution = Adjustment(
+    solution = Solution(
         geo_from_model=similarity.to_record("model", "geo", pivot=pivot),
         model_from_local=scene.model_from_local.to_record("local", "model"),
         cameras=_cameras(scene, poses),
         lenses=tuple(
-            TrainedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
+            SolvedLens(camera_id=key, model=camera.model, params=tuple(camera.params.tolist()))
             for key, camera in (sparse.lenses.moved(state.lens).cameras.items() if len(state.lens) else ())
         ),
-        gnss_outliers=initial.gnss_outliers,
-        control_outliers=initial.control_outliers,
+        **verdict.verdict | {"cautions": union(verdict.cautions)},
         estimated_errors=problem.errors.estimates(state.errors, covariance),
         measurements=tuple(_measurements(near, normal, rejected)),
         sigma_px=problem.bundle.sigma_px,
         sigma_datum_m=problem.sigma_datum_m,
         earlier=problem.earlier,
-        variance_factors=initial.variance_factors,
-        cautions=union(initial.cautions),
     )
     of_cameras = camera_covariances(normal, similarity.rotation, similarity.scale)
     of_cameras[:, 3:, 3:] += np.diag(np.square(problem.sigma_datum_m))
@@ -93,7 +89,7 @@ def _common_rows(near: Linearised, normal: NormalMatrix) -> CommonRows | None:
     return CommonRows(np.array(term.name, dtype=np.int64), csr_matrix(weigh @ rows.by_poses), by_border)
 
 
-def posterior_of(workspace: Workspace, solution: Adjustment, sfm: SparseModel) -> Posterior:
+def posterior_of(workspace: Workspace, solution: Solution, sfm: SparseModel) -> Posterior:
     """Return the posterior that is stored beside a solution of a workspace.
 
     Raises:
@@ -104,12 +100,12 @@ def posterior_of(workspace: Workspace, solution: Adjustment, sfm: SparseModel) -
     return load_posterior(workspace.path(product), solution, sfm)
 
 
-def _cameras(scene: Scene, poses: CameraPoses) -> tuple[TrainedCamera, ...]:
+def _cameras(scene: Scene, poses: CameraPoses) -> tuple[SolvedCamera, ...]:
     train = set(map(int, scene.train))
     quats = quat_xyzw_from_matrix(poses.cam_from_model)
     translations = -np.einsum("nij,nj->ni", poses.cam_from_model, poses.cam_center_in_model)
     return tuple(
-        TrainedCamera(
+        SolvedCamera(
             name=name,
             split="train" if index in train else "test",
             quat_xyzw=tuple(quats[index]),
@@ -180,7 +176,7 @@ def _left_out(near: Linearised, control: ControlPoints, normal: NormalMatrix) ->
     known = np.linalg.eigvalsh((free + np.swapaxes(free, 1, 2)) / 2)[:, 0] > _OPEN
     rows: list[dict[str, object]] = [{} for _ in known]
     for row in np.flatnonzero(known):
-        unwhiten = np.linalg.inv(control.root_information[row])
+        unwhiten = np.linalg.cholesky(control.cov[row])
         error = unwhiten @ np.linalg.solve(free[row], white[row])
         others = np.linalg.solve(np.eye(3) - expected[kind][row] * spread[row], spread[row])
         cov = unwhiten @ (np.eye(3) + (others + others.T) / 2) @ unwhiten.T

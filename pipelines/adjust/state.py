@@ -5,19 +5,29 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.survey.report_parts import EstimatedError
 
-SIGMA_ARM_M = 1.0  # wider than any error of a mounting, and finite, so that unobservable errors show by their σ
+# Priors of lever arm and boresight, in `calibrate` and in the adjustment: wider than any error of a mounting, and
+# finite, so that what a flight leaves open shows by its σ. Wider ones would change no observed value by more than
+# 1 %, and would only enlarge the σ of heights that a downward lever arm takes up.
+SIGMA_ARM_M, SIGMA_BORESIGHT_RAD = 1.0, float(np.radians(5.0))
 SIGMA_LIDAR_M = 1.0
-SIGMA_BORESIGHT_RAD = np.radians(5.0)
-# A component counts as observed if its σ is at most this part of the prior's.
-_OBSERVED_PART = 0.5
+# A component counts as observed if its σ is at most this part of the prior's. The prior of a mount only keeps the σ
+# finite: at a tenth of it, 0.1 m or 0.5°, it moves an estimate by 1 % of the way to its start. The other priors are
+# what is known of the error.
+_OBSERVED_PART, _OBSERVED_PART_OF_MOUNT = 0.5, 0.1
 
 ErrorName = Literal["bias", "drift", "lever-arm", "boresight", "common", "lidar-shift", "earlier-date"]
+
+
+def is_observed(name: ErrorName, sigma: FloatArray, prior: FloatArray | float) -> BoolArray:
+    """Return the mask (3,) of the components that the measurements determine, by their σ and that of the prior."""
+    part = _OBSERVED_PART_OF_MOUNT if name in ("lever-arm", "boresight") else _OBSERVED_PART
+    return np.asarray(sigma <= part * np.asarray(prior))
 
 
 @dataclass(frozen=True)
@@ -88,7 +98,7 @@ class SystematicErrors:
                     value=tuple((factor * value).tolist()),
                     sigma=tuple((factor * sigma).tolist()),
                     prior=tuple((factor * prior).tolist()),
-                    observed=tuple((sigma <= _OBSERVED_PART * prior).tolist()),
+                    observed=tuple(is_observed(block.name, sigma, prior).tolist()),
                 )
             )
         return tuple(estimates)

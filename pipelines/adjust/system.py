@@ -34,7 +34,7 @@ from pipelines.geometry.rotations import skew
 from pipelines.geometry.similarity import perturbation
 from pipelines.geometry.sparse_cholesky import SparseCholesky
 from pipelines.geometry.statistics import NOISE_WEIGHT, cauchy_loss, cauchy_weight
-from pipelines.survey.trained_model import EarlierDate
+from pipelines.survey.solution import EarlierDate
 
 _ROUNDS = 150
 _STILL = 5e-6  # change of a whitened residual that ends the descent
@@ -72,7 +72,7 @@ class Problem:
         """All terms, the prior of the systematic errors among them."""
         if not self.errors.blocks:
             return self.measured
-        prior = CommonErrors(np.array([np.diag(1.0 / np.array(block.sigma)) for block in self.errors.blocks]))
+        prior = CommonErrors(np.array([np.diag(np.square(block.sigma)) for block in self.errors.blocks]))
         return (*self.measured, prior)
 
     def term(self, kind: str) -> Term | None:
@@ -331,6 +331,7 @@ class Minimum:
 
 
 def linearised(problem: Problem, state: State) -> Linearised:
+    """Return the problem linearised at a state: whitened residuals and derivatives of all terms, by kind."""
     at = problem.at(state)
     slopes = {term.kind: (term.root_information, term.slopes(at)) for term in problem.terms}
     has_points = any(slope.by_similarity is not None for _, slope in slopes.values())

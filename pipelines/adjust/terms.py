@@ -1,6 +1,6 @@
 """Terms of the adjustment: measurements of one kind, with their residuals and derivatives (GeoRefGS section 2.4).
 
-A term consists of the observations of one kind: residuals, their root information, and their derivatives by the
+A term consists of the observations of one kind: residuals, their covariance, and their derivatives by the
 cameras, the lens and the systematic errors. The similarity has no derivative of its own: the corrections of the
 cameras contain it (`adjust.system`). A new kind of measurement is one subclass of `Term`.
 """
@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
 from pipelines.adjust.state import SystematicErrors
 from pipelines.core.types import FloatArray, IntArray, Rows
+from pipelines.geometry.intersection import NearestPoints, across_rays, nearest_points
 from pipelines.geometry.rotations import exp_so3, log_so3, right_jacobian_inverse_so3, skew
 from pipelines.geometry.similarity import Similarity, jacobian_at
+from pipelines.geometry.statistics import root_information
 
 _FIXED = 2e-6  # σ of what nothing measures in a local frame: of a rotation, and of a shift over the radius
 
@@ -58,7 +61,12 @@ class Term(Rows, ABC):
 
     kind: ClassVar[str]  # name in normal equations, tests and products
     dimension: ClassVar[int] = 3  # d, of a residual
-    root_information: FloatArray  # (M, d, d), W with WᵀW = Σ⁻¹
+    cov: FloatArray  # (M, d, d), Σ of the observations
+
+    @cached_property
+    def root_information(self) -> FloatArray:
+        """W (M, d, d) with WᵀW = Σ⁻¹, which whitens the residuals."""
+        return root_information(self.cov)
 
     @abstractmethod
     def residuals(self, at: At) -> FloatArray:
@@ -82,7 +90,7 @@ class Fixes(Term):
     name: tuple[str, ...]
     camera: IntArray  # (F,) index into the cameras
     position_in_geo: FloatArray  # (F, 3) metres
-    root_information: FloatArray  # (F, 3, 3) of the fixes' own errors, in 1/m
+    cov: FloatArray  # (F, 3, 3) m², of the fixes' own errors
     session: IntArray  # (F,) session of each fix, whose common error they share
     # (F, K) shapes in time of the drift of each session, for a factor of 1; without drift it is not read
     drift: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -142,55 +150,34 @@ class MarkedTerm(Term):
 
     def places(self, at: At) -> FloatArray:
         """Return the points (J, 3) in metres of geo."""
-        return at.geo_from_model.apply(self._intersected(at)[0])
+        return at.geo_from_model.apply(self._intersected(at)[0].position)
 
     def place_slopes(self, at: At) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the points (J, 3) in geo, and derivatives (K, 3, 6) by each mark's pose and (K, 3, L) by the lens.
 
         A point's derivative by the lens is the sum over its marks.
         """
-        position, weight, direction, bearing_scale = self._intersected(at)
-        arm = position[self.point] - at.center[self.camera]
-        along = np.einsum("ki,ki->k", direction, arm)
-        across = arm - along[:, None] * direction
-        projector = _projector(direction)
-        normal = np.zeros((len(position), 3, 3))
-        np.add.at(normal, self.point, weight[:, None, None] * projector)
-        # N dx = Σ w (P dc − dP (x − c)), and −dP (x − c) = (ρ I + d eᵀ) dd with x − c = ρ d + e.
-        by_center = np.linalg.solve(normal, np.eye(3))[self.point] * weight[:, None, None]
-        by_direction = by_center @ (along[:, None, None] * np.eye(3) + direction[:, :, None] * across[:, None, :])
+        met, bearing_scale = self._intersected(at)
+        by_center, by_direction = met.derivatives()
         to_geo = at.geo_from_model.scale * at.geo_from_model.rotation
-        by_turn = by_direction @ -skew(direction) @ at.turn_by_correction[self.camera]
-        by_pose = to_geo @ np.concatenate([by_turn, by_center @ projector], axis=2)
-        turn = np.swapaxes(at.cam_from_model[self.camera], 1, 2)
+        by_turn = by_direction @ -skew(met.direction) @ at.turn_by_correction[self.camera]
+        by_pose = to_geo @ np.concatenate([by_turn, by_center], axis=2)
         by_lens = np.zeros((len(self.point), 3, len(at.lens)))
         if len(at.lens):
-            by_lens = to_geo @ by_direction @ projector @ turn @ self.bearing_by_lens / bearing_scale[:, None, None]
-        return at.geo_from_model.apply(position), by_pose, by_lens
+            turn = np.swapaxes(at.cam_from_model[self.camera], 1, 2)
+            by_bearing = to_geo @ by_direction @ across_rays(met.direction) @ turn
+            by_lens = by_bearing @ self.bearing_by_lens / bearing_scale[:, None, None]
+        return at.geo_from_model.apply(met.position), by_pose, by_lens
 
-    def _intersected(self, at: At) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the points (J, 3) in `model` nearest to the rays of their marks, with weights and directions (K).
-
-        The rays are weighted by their inverse lateral variance at the point, (angular σ × distance)⁻²; GeoRefGS
-        eqs 4–8. The last array is the length of the bearings before normalisation.
-        """
+    def _intersected(self, at: At) -> tuple[NearestPoints, FloatArray]:
+        """Return the points in `model` nearest to their rays, and the lengths (K,) of unnormalised bearings."""
         bearing = self.bearing_in_cam
         if len(at.lens):
             bearing = bearing + self.bearing_by_lens @ at.lens
         length = np.linalg.norm(bearing, axis=1)
-        center = at.center[self.camera]
         direction = np.einsum("kji,kj->ki", at.cam_from_model[self.camera], bearing / length[:, None])
-        projector = _projector(direction)
-        count = self.per_observation * len(self)
-        position, weight = np.zeros((count, 3)), np.asarray(1.0 / self.sigma_rad**2)
-        for _ in range(2):  # the first pass gives the distances, and so the weights
-            normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
-            np.add.at(normal, self.point, weight[:, None, None] * projector)
-            np.add.at(right, self.point, weight[:, None] * np.einsum("kij,kj->ki", projector, center))
-            position = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0])
-            distance = np.linalg.norm(position[self.point] - center, axis=1)
-            weight = 1.0 / (self.sigma_rad * distance) ** 2
-        return position, weight, direction, length
+        center, count = at.center[self.camera], self.per_observation * len(self)
+        return nearest_points(self.point, center, direction, self.sigma_rad, count), length
 
 
 @dataclass(frozen=True)
@@ -200,7 +187,7 @@ class ControlPoints(MarkedTerm):
     kind: ClassVar[str] = "control points"
 
     position_in_geo: FloatArray  # (J, 3) metres, surveyed
-    root_information: FloatArray  # (J, 3, 3) of survey and intersection together, in 1/m
+    cov: FloatArray  # (J, 3, 3) m², of survey and intersection together
 
     def residuals(self, at: At) -> FloatArray:
         """Return S(x_j) + v − X_j (J, 3) in metres, with x_j the intersection of the marks of point j.
@@ -234,7 +221,7 @@ class EarlierPoints(MarkedTerm):
     kind: ClassVar[str] = "common points"
 
     position_in_geo: FloatArray  # (J, 3) metres, by the earlier solution
-    root_information: FloatArray  # (J, 3, 3) of the marks of both dates together, in 1/m
+    cov: FloatArray  # (J, 3, 3) m², of the marks of both dates together
 
     def residuals(self, at: At) -> FloatArray:
         """Return S(x_j) − X_j (J, 3) in metres, with x_j the intersection of the track of point j."""
@@ -257,7 +244,7 @@ class Distances(MarkedTerm):
     per_observation: ClassVar[int] = 2
 
     distance_m: FloatArray  # (D,) measured
-    root_information: FloatArray  # (D, 1, 1) of measurement and intersections together, in 1/m
+    cov: FloatArray  # (D, 1, 1) m², of measurement and intersections together
 
     def residuals(self, at: At) -> FloatArray:
         """Return |S(x_a) − S(x_b)| − d (D, 1) in metres."""
@@ -289,7 +276,7 @@ class Attitudes(Term):
     name: tuple[str, ...]
     camera: IntArray  # (A,) index into the cameras
     geo_from_cam: FloatArray  # (A, 3, 3), of the nominal camera axes
-    root_information: FloatArray  # (A, 3, 3), in 1/rad
+    cov: FloatArray  # (A, 3, 3) rad²
 
     def residuals(self, at: At) -> FloatArray:
         """Return Log(R_iᵀ G_i B) (A, 3) in radians, from a camera to its recorded axes, with the boresight B."""
@@ -336,7 +323,7 @@ class Planes(Term):
     point_in_model: FloatArray  # (M, 3) metres, on the surface of the photographs
     position_in_geo: FloatArray  # (M, 3) metres, on the plane of the LiDAR
     normal_in_geo: FloatArray  # (M, 3) unit normals of the planes
-    root_information: FloatArray  # (M, 1, 1), in 1/m, of the distance between both along the normal
+    cov: FloatArray  # (M, 1, 1) m², of the distance between both along the normal
 
     def residuals(self, at: At) -> FloatArray:
         """Return n · (S(x) + shift − p) (M, 1) in metres."""
@@ -375,7 +362,7 @@ class Level(Term):
 
     up_in_model: FloatArray  # (1, 3) unit vector
     axes_in_model: FloatArray  # (1, 2, 3) unit vectors square to it, about which it turns
-    root_information: FloatArray  # (1, 2, 2), in 1/rad
+    cov: FloatArray  # (1, 2, 2) rad²
 
     def residuals(self, at: At) -> FloatArray:
         """Return 2 tan(θ/2) (1, 2) along the axes, θ being the turn from the known to the solved vertical."""
@@ -417,13 +404,12 @@ class CommonErrors(Term):
     """Prior of the systematic errors as measurements of the value zero: the surplus of a wrong one is rejected.
 
     One error that every fix of a session shares may be far larger than its σ says: a base station on wrong
-    coordinates. Cauchy's kernel then sets the prior aside, as it does with a bad fix. The root information is
-    (B, 3, 3), by block.
+    coordinates. Cauchy's kernel then sets the prior aside, as it does with a bad fix.
     """
 
     kind: ClassVar[str] = "systematic errors"
 
-    root_information: FloatArray
+    cov: FloatArray  # (B, 3, 3) m² or rad², by block
 
     def residuals(self, at: At) -> FloatArray:
         return at.vector.reshape(-1, 3)
@@ -445,12 +431,12 @@ class LocalFrame(Term):
 
     kind: ClassVar[str] = "local frame"
 
-    root_information: FloatArray  # (2, 3, 3), in 1/rad and 1/m
+    cov: FloatArray  # (2, 3, 3), rad² and m²
 
     @classmethod
     def fixed(cls, radius_m: float) -> LocalFrame:
         """Return the frame of cameras within a radius, fixed with σ below those of measurements, above rounding."""
-        return cls(np.eye(3) / (_FIXED * np.array([1.0, radius_m]))[:, None, None])
+        return cls(np.square(_FIXED * np.array([1.0, radius_m]))[:, None, None] * np.eye(3))
 
     def residuals(self, at: At) -> FloatArray:
         return np.zeros((2, 3))
@@ -461,12 +447,3 @@ class LocalFrame(Term):
         by_similarity[0, :, 1:4], by_similarity[1, :, 4:] = turn, at.geo_from_model.scale * turn
         no_lens, no_errors = np.zeros((2, 3, len(at.lens))), np.zeros((2, 3, len(at.vector)))
         return Slopes(self.residuals(at), none, none, np.zeros((0, 3, 6)), no_lens, no_errors, by_similarity)
-
-
-def root_information(covariance: FloatArray) -> FloatArray:
-    """Return W (N, 3, 3) with WᵀW = Σ⁻¹, from covariances Σ (N, 3, 3)."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
-
-
-def _projector(direction: FloatArray) -> FloatArray:
-    return np.eye(3) - direction[:, :, None] * direction[:, None, :]

@@ -7,7 +7,8 @@ unknown of the later adjustment (`earlier-date` in `adjust.state`), beside the c
 
 import numpy as np
 
-from pipelines.adjust.joint import JointAdjustment, Start
+from pipelines.adjust.joint import Consistency, Start
+from pipelines.adjust.system import Linearised
 from pipelines.adjust.terms import EarlierPoints
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import NOT_CHECKED, Remark
@@ -15,7 +16,7 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import RansacOptions, cauchy_weight, mad_sigma, ransac
-from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.adjustment import SimilarityEstimate
 from pipelines.survey.survey import Survey
 
 FEW_COMMON = 30  # points: a lens, and the shape of a block, take more
@@ -56,7 +57,7 @@ def common_similarity(
     return similarity, np.asarray(squares(similarity) <= 1.0)
 
 
-def start_at_common(survey: Survey, model: SparseModel, aligned: InitialSimilarity) -> tuple[Start, ...]:
+def start_at_common(survey: Survey, model: SparseModel, aligned: SimilarityEstimate) -> tuple[Start, ...]:
     """Return the start that the points in common with an earlier date set; none: there are none."""
     common = survey.common
     if common is None:
@@ -70,18 +71,18 @@ def start_at_common(survey: Survey, model: SparseModel, aligned: InitialSimilari
     except DegenerateGeometryError:
         return ()
     record = similarity.to_record("local", "geo")
-    return (Start(aligned.model_copy(update={"geo_from_local": record, "gnss_outliers": ()}), at_control=True),)
+    return (Start(aligned.model_copy(update={"geo_from_local": record}), at_control=True),)
 
 
-def outliers_in_common(joint: JointAdjustment) -> tuple[int, ...]:
+def outliers_in_common(near: Linearised, consistency: Consistency) -> tuple[int, ...]:
     """Return COLMAP's ids of the points in common that disagree with the others.
 
     Ground that has moved takes its points with it: where most of the points in a block disagree, all are left out.
     """
-    term = joint.problem.term(EarlierPoints.kind)
+    term = near.problem.term(EarlierPoints.kind)
     if not isinstance(term, EarlierPoints):
         return ()
-    used = joint.components[term.kind].used.copy()
+    used = consistency.used[term.kind].copy()
     place = term.position_in_geo[:, :2]
     side = max(float(np.ptp(place, axis=0).max()) / _BLOCKS, 1e-6)
     blocks = np.unique(np.floor((place - place.min(axis=0)) / side), axis=0, return_inverse=True)[1].reshape(-1)
@@ -91,19 +92,18 @@ def outliers_in_common(joint: JointAdjustment) -> tuple[int, ...]:
     return tuple(int(name) for name, good in zip(term.name, used, strict=True) if not good)
 
 
-def cautions_of_common(survey: Survey, joint: JointAdjustment) -> tuple[Remark, ...]:
+def cautions_of_common(survey: Survey, near: Linearised, consistency: Consistency) -> tuple[Remark, ...]:
     """Return what limits a survey that is tied to an earlier date: few points, on one side, or a worse place."""
-    common, term = survey.common, joint.problem.term(EarlierPoints.kind)
+    common, term = survey.common, near.problem.term(EarlierPoints.kind)
     if common is None or not isinstance(term, EarlierPoints):
         return ()
-    used, found = ~np.isin(term.name, [str(name) for name in outliers_in_common(joint)]), []
+    outliers = [str(name) for name in outliers_in_common(near, consistency)]
+    used, found = ~np.isin(term.name, outliers), []
     count, spread = int(used.sum()), float(common.spread)
     if count < FEW_COMMON:
-        sentence = (
-            f"{count} points tie this date to {common.name}, where {FEW_COMMON} are enough for its shape. Give sfm "
-            "a larger --max-features."
-        )
-        found.append(Remark(code="few-common-points", sentence=sentence))
+        sentence = f"{count} points tie this date to {common.name}, where {FEW_COMMON} are enough for its shape."
+        remedy = "Give sfm a larger --max-features."
+        found.append(Remark(code="few-common-points", sentence=sentence, remedy=remedy))
     if spread < NARROW_SPREAD:
         sentence = (
             f"The points in common with {common.name} cover {spread:.0%} of the ground that both dates show: the "
@@ -119,14 +119,12 @@ def cautions_of_common(survey: Survey, joint: JointAdjustment) -> tuple[Remark, 
     if not bool(common.checked):
         sentence = f"The places are those of {common.name}, of which nothing checks the stated σ."
         found.append(Remark(code=NOT_CHECKED, sentence=sentence))
-    return (*found, *_of_place(joint, common.name))
+    return (*found, *_of_place(consistency, common.name))
 
 
-def _of_place(joint: JointAdjustment, name: str) -> tuple[Remark, ...]:
+def _of_place(consistency: Consistency, name: str) -> tuple[Remark, ...]:
     """Return the caution that this survey's own measurements know the place better than the earlier date."""
-    errors = joint.problem.errors
-    covariance = joint.normal.of_errors(len(joint.problem.lens), len(errors))
-    for error in errors.estimates(joint.state.errors, covariance):
+    for error in consistency.estimates:
         if error.name != "earlier-date" or not all(error.observed):
             continue
         value, sigma, prior = (np.array(part) for part in (error.value, error.sigma, error.prior))
@@ -136,7 +134,8 @@ def _of_place(joint: JointAdjustment, name: str) -> tuple[Remark, ...]:
         sentence = (
             f"Own measurements put this date {east:+.2f} m east, {north:+.2f} m north and {up:+.2f} m up of its "
             f"place by {name}, ± {sigma.max():.2f} m at most. It has taken over that place, with a σ of "
-            f"{prior.max():.2f} m. For its own, solve this date alone, and {name} with this one as --earlier."
+            f"{prior.max():.2f} m."
         )
-        return (Remark(code="earlier-date-less-accurate", sentence=sentence),)
+        remedy = f"For its own, solve this date alone, and {name} with this one as --earlier."
+        return (Remark(code="earlier-date-less-accurate", sentence=sentence, remedy=remedy),)
     return ()

@@ -126,8 +126,9 @@ def _sorted(path: Path, grid: CommonGrid, folder: Path, progress: Progress) -> T
     if (own.crs_wkt, own.vertical_datum) != (rasters.crs_wkt, rasters.vertical_datum):
         raise InputError(
             "epochs-differ-in-crs",
-            "is in another CRS than the rasters. Export cloud and rasters of both with one --crs and --vertical.",
+            "is in another CRS than the rasters.",
             path=path,
+            remedy="Export cloud and rasters of both with one --crs and --vertical.",
         )
     points = TiledPoints(folder, _SQUARE_M)
     with progress.task("cloud", file.count) as task:

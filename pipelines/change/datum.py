@@ -23,8 +23,9 @@ from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.solution import read_sfm, read_solution
 from pipelines.survey.survey import FixSession, Survey
-from pipelines.survey.trained_survey import load_cameras
 
 _SAME_PLACE_M = 0.02  # between the coordinates of one control point in both surveys
 _MOST_SHARED = 0.98  # of the smaller variance: the difference of two flights is never exact
@@ -54,13 +55,14 @@ class Epoch:
 
 
 def load_epoch(workspace: Workspace) -> Epoch:
-    """Return an epoch of a workspace; errors as of `load_cameras` and `posterior_of`."""
-    solved = load_cameras(workspace)
-    posterior = posterior_of(workspace, solved.model, solved.sfm)
-    if not is_checked(solved.model.cautions):
-        return Epoch(solved.survey, None, "nothing checks the σ of the positions", solved.model.cautions, posterior)
+    """Return an epoch of a workspace; errors as of `read_solution` and `posterior_of`."""
+    solution = read_solution(workspace)
+    survey, cautions = solution.weighted(load_survey(workspace)), solution.cautions
+    posterior = posterior_of(workspace, solution, read_sfm(workspace, solution))
+    if not is_checked(cautions):
+        return Epoch(survey, None, "nothing checks the σ of the positions", cautions, posterior)
     reason = "" if posterior.grid is not None else "the scene has too few points"
-    return Epoch(solved.survey, posterior.grid, reason, solved.model.cautions, posterior)
+    return Epoch(survey, posterior.grid, reason, cautions, posterior)
 
 
 @dataclass(frozen=True)

@@ -147,8 +147,11 @@ def unchanged_ground(samples: Samples, cell_m: float, prior_h_m: float, *, with_
         if kept.sum() < _LEAST_STABLE:
             raise DegenerateGeometryError(
                 "no-stable-ground",
-                f"Only {int(kept.sum())} cells of level, measured and unchanged ground are common to both epochs; "
-                f"{_LEAST_STABLE} are needed. Give polygons of unchanged ground with --stable, or smaller cells.",
+                (
+                    f"Only {int(kept.sum())} cells of level, measured and unchanged ground are common to both "
+                    f"epochs; {_LEAST_STABLE} are needed."
+                ),
+                remedy="Give polygons of unchanged ground with --stable, or smaller cells.",
             )
         weight = huber_weight((residual[kept] / scale) ** 2) / (scale * sigma[kept]) ** 2
         rows = design[kept]
@@ -296,7 +299,7 @@ class Volume:
         return float(cell_m2 * np.sqrt(self.datum**2 + factor * self.variance * joined + self.steps))
 
 
-def volumes(number: NDArray[Any], cells: Cells, count: int) -> list[Volume]:
+def region_volumes(number: NDArray[Any], cells: Cells, count: int) -> list[Volume]:
     """Return the sums of regions 1 … `count`, by the number (H, W) of each cell; 0: no region.
 
     A wall lies in the neighbourhood of the cells on both of its sides: its error in a volume is half their sum, and

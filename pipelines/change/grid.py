@@ -8,7 +8,7 @@ the ground. Such cells have a variance of their own (`step_variance`).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 from pipelines.change.datum import Epoch, Shared
-from pipelines.change.detection import LAGS, STEEPEST, Cells, Samples
+from pipelines.change.detection import LAGS, STEEPEST, Cells, Noise, Samples
 from pipelines.change.tied import Tied
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import load_json
@@ -24,11 +24,12 @@ from pipelines.core.progress import Progress
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
-from pipelines.formats.geotiff import RasterFrame, cells_inside, frame_of, is_same_crs, read_onto
+from pipelines.formats.geotiff import RasterFrame, cells_inside, is_same_crs, raster_frame, read_onto
 from pipelines.geodesy.crs import PointCrs, parse_crs
 
 WINDOW_PX = 1024
 MEASURED = 255  # in measured.tif
+UNCHANGED, LOWERED, RAISED, DOUBTFUL = 1, 2, 3, 4  # in significant.tif; 0: not measured in both
 _NODE_PX = 64
 _SAMPLES = 400_000
 _PAIRS = 40_000  # of each distance
@@ -68,15 +69,14 @@ def epoch_rasters(workspace: Workspace, of: Literal["surface", "terrain"]) -> Ep
         raise InputError("not-on-earth", message, path=path)
     crs = parse_crs(sidecar.crs_wkt, path=path)
     if crs.is_geographic:
-        message = (
-            "has cells in degrees, in which no volume can be stated. Export both with --crs of a map projection."
-        )
-        raise InputError("change-needs-projected-crs", message, path=path)
-    return EpochRasters(folder, of, frame_of(path), sidecar, crs.height_unit_m)
+        message = "has cells in degrees, in which no volume can be stated."
+        remedy = "Export both with --crs of a map projection."
+        raise InputError("change-needs-projected-crs", message, path=path, remedy=remedy)
+    return EpochRasters(folder, of, raster_frame(path), sidecar, crs.height_unit_m)
 
 
 @dataclass(frozen=True)
-class Window:
+class GridWindow:
     """Window of the grid by first column and row, with its cells."""
 
     column: int
@@ -148,17 +148,17 @@ class CommonGrid:
     def cell_m2(self) -> float:
         return self.frame.step_x * self.frame.step_y * self.unit_m**2
 
-    def windows(self) -> Iterator[Window]:
+    def windows(self) -> Iterator[GridWindow]:
         for row in range(0, self.frame.rows, WINDOW_PX):
             for column in range(0, self.frame.columns, WINDOW_PX):
-                yield Window(
+                yield GridWindow(
                     column,
                     row,
                     min(WINDOW_PX, self.frame.columns - column),
                     min(WINDOW_PX, self.frame.rows - row),
                 )
 
-    def around(self, window: Window, reach: int) -> tuple[Window, tuple[slice, slice]]:
+    def around(self, window: GridWindow, reach: int) -> tuple[GridWindow, tuple[slice, slice]]:
         """Return a window widened as far as the grid goes, and the place of the first in it."""
         left, top = max(window.column - reach, 0), max(window.row - reach, 0)
         columns = min(window.column + window.columns + reach, self.frame.columns) - left
@@ -167,18 +167,18 @@ class CommonGrid:
             slice(window.row - top, window.row - top + window.rows),
             slice(window.column - left, window.column - left + window.columns),
         )
-        return Window(left, top, columns, rows), own
+        return GridWindow(left, top, columns, rows), own
 
-    def part(self, window: Window) -> RasterFrame:
+    def part(self, window: GridWindow) -> RasterFrame:
         return self.frame.part(window.column, window.row, window.columns, window.rows)
 
-    def place_m(self, window: Window) -> FloatArray:
+    def place_m(self, window: GridWindow) -> FloatArray:
         """Return the places (H, W, 2) of cells, east and north of the middle of the grid."""
         x = (window.column + np.arange(window.columns) + 0.5 - self.frame.columns / 2) * self.frame.step_x
         y = (self.frame.rows / 2 - window.row - np.arange(window.rows) - 0.5) * self.frame.step_y
         return np.stack(np.meshgrid(x, y), axis=-1) * self.unit_m
 
-    def heights_m(self, window: Window) -> tuple[FloatArray, FloatArray]:
+    def heights_m(self, window: GridWindow) -> tuple[FloatArray, FloatArray]:
         """Return the heights (H, W) of both epochs, where both have some, measured or not; NaN elsewhere."""
         frame = self.part(window)
         heights = [self._read(one, one.names[0], frame) * one.unit_m for one in self.rasters]
@@ -187,7 +187,7 @@ class CommonGrid:
             known &= cells_inside(self._inside, frame)
         return np.where(known, heights[0], np.nan), np.where(known, heights[1], np.nan)
 
-    def cells(self, window: Window) -> Cells:
+    def cells(self, window: GridWindow) -> Cells:
         """Return the cells of a window, before any registration."""
         wide, own = self.around(window, _MARGIN)
         heights = self.heights_m(wide)
@@ -214,6 +214,16 @@ class CommonGrid:
         difference = (heights[1] - heights[0])[own]
         datum = np.where(np.isfinite(difference), self._between(self._node_datum, window), np.nan)
         return Cells(difference, variance, datum, slopes[0], step, both)
+
+    def registered(self, window: GridWindow, noise: Noise, *, applied: bool) -> Cells:
+        """Return the cells of a window, after the registration if that is applied, with the σ neighbours share."""
+        cells = self.cells(window)
+        if not applied:
+            return replace(cells, datum_m=np.maximum(cells.datum_m, noise.long_range_m))
+        moved = noise.moved_by(cells.slope, self.place_m(window))
+        datum = np.hypot(np.sqrt(noise.shift_cov_m2[2, 2]), noise.long_range_m)
+        shape = cells.difference_m.shape
+        return replace(cells, difference_m=cells.difference_m - moved, datum_m=np.full(shape, datum))
 
     def _slope(self, height_m: FloatArray) -> FloatArray:
         if min(height_m.shape) < 2:
@@ -266,7 +276,7 @@ class CommonGrid:
             return np.ones((frame.rows, frame.columns), dtype=bool)
         return np.asarray(read_onto(one.folder / "measured.tif", frame, "nearest") == MEASURED)
 
-    def _between(self, nodes: FloatArray, window: Window) -> FloatArray:
+    def _between(self, nodes: FloatArray, window: GridWindow) -> FloatArray:
         row = (window.row + np.arange(window.rows) + 0.5) / self._steps[0]
         column = (window.column + np.arange(window.columns) + 0.5) / self._steps[1]
         return np.asarray(map_coordinates(nodes, np.meshgrid(row, column, indexing="ij"), order=1, mode="nearest"))
@@ -299,17 +309,14 @@ def step_variance(height_m: FloatArray, sigma_m: FloatArray, cell_m: float, reac
 def _common_frame(before: EpochRasters, after: EpochRasters) -> RasterFrame:
     path = before.folder / before.names[0]
     if not is_same_crs(before.frame, after.frame):
-        message = (
-            f"is in {before.sidecar.crs}, and that of the later epoch in {after.sidecar.crs}. Export both with the "
-            "same --crs."
-        )
-        raise InputError("epochs-differ-in-crs", message, path=path)
+        message = f"is in {before.sidecar.crs}, and that of the later epoch in {after.sidecar.crs}."
+        remedy = "Export both with the same --crs."
+        raise InputError("epochs-differ-in-crs", message, path=path, remedy=remedy)
     datums = before.sidecar.vertical_datum.name, after.sidecar.vertical_datum.name
     if datums[0] != datums[1]:
-        message = (
-            f"has heights above {datums[0]}, the later epoch above {datums[1]}. Export both with one --vertical."
-        )
-        raise InputError("epochs-differ-in-heights", message, path=path)
+        message = f"has heights above {datums[0]}, the later epoch above {datums[1]}."
+        remedy = "Export both with one --vertical."
+        raise InputError("epochs-differ-in-heights", message, path=path, remedy=remedy)
     coarser = max(before.frame, after.frame, key=lambda frame: frame.step_x)
     bounds = np.array([before.frame.bounds, after.frame.bounds])
     west, south = bounds[:, :2].max(axis=0).tolist()

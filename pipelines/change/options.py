@@ -15,7 +15,22 @@ PolygonFile = Annotated[Path, InputMarker(BOUNDARY_SUFFIXES), ExtraMarker("vecto
 
 
 class ChangeOptions(StageOptions):
-    """Options of the comparison of two epochs. `before` is the workspace of the earlier one."""
+    """Options of the comparison of two epochs. `before` is the workspace of the earlier one.
+
+    WS1 is the earlier epoch, WS2 the later one, which gets the folder change/: rasters of the difference of
+    heights, its σ, its level of detection at 95 % and the significant change; regions with cut, fill and net volume
+    ± σ as GeoJSON, GeoPackage and table; change.json. Both need the rasters of georef export-raster, in one --crs.
+
+    Without registration, the σ of both adjustments counts, less what they share: control points of one name and
+    place, and the base with --same-base. --stable FILE or --stable-auto registers the later epoch on unchanged
+    ground; the shift is stated with its σ. Dates that were adjusted onto each other (--earlier of sfm) need none;
+    of a chain of them, the volumes are stated at each date between both.
+
+    Examples:
+      georef change spring autumn
+      georef change spring autumn --stable roads.geojson --regions stockpiles.gpkg
+      georef change spring autumn --stable-auto --of terrain
+    """
 
     before: Annotated[Path, InputMarker(only=COMPARED)] = Field(
         Path(), description="Workspace of the earlier epoch."
@@ -51,3 +66,8 @@ class ChangeOptions(StageOptions):
     )
     reach: float = Field(1.0, gt=0, le=50, description="Largest change along a normal that is found, in metres.")
     min_area: float = Field(1.0, gt=0, description="Area of the smallest region in square metres.")
+
+    @property
+    def is_registered(self) -> bool:
+        """Whether the later epoch is registered on unchanged ground."""
+        return self.stable is not None or self.stable_auto

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import resources
@@ -13,17 +14,17 @@ import shapely
 from numpy.typing import NDArray
 
 from pipelines import __version__
-from pipelines.change.grid import WINDOW_PX, CommonGrid
+from pipelines.change.grid import LOWERED, RAISED, UNCHANGED, WINDOW_PX, CommonGrid
 from pipelines.change.renders import render_pair
 from pipelines.change.tied import Tied
 from pipelines.core.products import Remark
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray, FloatArray
 from pipelines.core.workspace import Workspace
-from pipelines.formats.geotiff import RasterFrame, frame_of, read_cells, read_colours_onto, read_onto
+from pipelines.formats.geotiff import RasterFrame, raster_frame, read_cells, read_colours_onto, read_onto
 from pipelines.report.page import Page, Picture, Section, moment, picture_of, picture_of_png
 from pipelines.report.plots.changes import (
-    Profile,
+    ChangeProfile,
     change_picture,
     difference_histogram,
     inside_parts,
@@ -51,7 +52,7 @@ class Compared:
 
     Attributes:
         folder: of the rasters that the comparison has written.
-        polygons: of the regions of `change`, in the CRS.
+        polygons, doubtful_polygons: of the regions of `change`, and of the doubtful ones, in the CRS.
         workspaces: of the earlier and the later epoch.
     """
 
@@ -61,6 +62,7 @@ class Compared:
     grid: CommonGrid
     workspaces: tuple[Workspace, Workspace]
     tied: Tied | None = None
+    doubtful_polygons: Sequence[Any] = ()
 
     @property
     def names(self) -> tuple[str, str]:
@@ -79,7 +81,7 @@ class Compared:
 
 
 @dataclass(frozen=True)
-class SummaryFacts:
+class ChangeSummaryFacts:
     """Figures at the top, and what limits them: of which epoch, or of none, and a sentence."""
 
     names: tuple[str, str]
@@ -113,6 +115,7 @@ class MapFacts:
     bar_px: float
     bar_m: float
     points: tuple[tuple[float, float, bool], ...] = ()
+    doubtful: tuple[Outline, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,7 @@ def change_page(
 ) -> Page:
     """Return the page of a comparison, with its warnings, and with the cautions of each epoch.
 
-    Raises as `load_trained`.
+    Raises as `render_pair`.
     """
     change = compared.change
     with progress.task("page", _STEPS) as task:
@@ -158,7 +161,7 @@ def change_page(
     remarks += [
         (f"{name}: ", remark.sentence) for name, own in zip(compared.names, cautions, strict=True) for remark in own
     ]
-    summary = SummaryFacts(
+    summary = ChangeSummaryFacts(
         compared.names, change.registration.applied, len(change.regions) - given, given, tuple(remarks)
     )
     return Page(
@@ -176,6 +179,7 @@ def change_page(
             Section("summary", "Summary", "summary_of_change.html", summary),
             Section("map", "Map", "map.html", seen),
             Section("regions", "Regions", "regions.html", summary),
+            *((Section("by-date", "Volumes by date", "by_date.html", change),) if change.by_date else ()),
             Section("profiles", "Profiles", "profiles.html", profiles),
             Section("orthophotos", "Before and after", "pair.html", photographs),
             Section("renders", "Both models from one camera", "pair.html", renders),
@@ -192,7 +196,7 @@ def map_facts(compared: Compared) -> MapFacts:
     later, cell_m = grid.rasters[1], frame.step_x * grid.unit_m
     height = read_onto(later.folder / later.names[0], frame, "average") * later.unit_m
     difference = read_onto(compared.folder / "difference.tif", frame, "average")
-    significant = read_onto(compared.folder / "significant.tif", frame, "nearest") > 1
+    significant = np.isin(read_onto(compared.folder / "significant.tif", frame, "nearest"), (LOWERED, RAISED))
     beyond = np.abs(difference[significant & np.isfinite(difference)])
     limit_m = round_up(
         float(np.quantile(beyond, _FULL_COLOUR)) if len(beyond) else 3 * compared.change.median_lod_m
@@ -202,9 +206,13 @@ def map_facts(compared: Compared) -> MapFacts:
         _outline(compared.change.regions[index].name, compared.polygons[index], frame)
         for index in compared.largest[:_MOST_NUMBERS]
     )
+    doubtful = tuple(
+        _outline(region.name, polygon, frame)
+        for region, polygon in zip(compared.change.doubtful, compared.doubtful_polygons, strict=True)
+    )
     bar_m = nice_number(_BAR_SHARE * frame.columns * cell_m)
     points = common_on_map(compared, frame)
-    return MapFacts(picture_of(pixels), outlines, scale_colours(), limit_m, bar_m / cell_m, bar_m, points)
+    return MapFacts(picture_of(pixels), outlines, scale_colours(), limit_m, bar_m / cell_m, bar_m, points, doubtful)
 
 
 def common_on_map(compared: Compared, frame: RasterFrame) -> tuple[tuple[float, float, bool], ...]:
@@ -239,7 +247,8 @@ def histogram_picture(compared: Compared) -> Picture:
     """Return the histogram of a sample of all cells that both epochs have measured."""
     difference, classes = sampled(compared.folder / "difference.tif"), sampled(compared.folder / "significant.tif")
     known = np.isfinite(difference) & (classes > 0)
-    stable, changed = difference[known & (classes == 1)], difference[known & (classes > 1)]
+    is_changed = np.isin(classes, (LOWERED, RAISED))
+    stable, changed = difference[known & (classes == UNCHANGED)], difference[known & is_changed]
     lod_m = compared.change.median_lod_m
     widest = max([float(np.quantile(np.abs(part), 0.98)) for part in (stable, changed) if len(part)], default=0.0)
     return picture_of_png(difference_histogram(stable, changed, lod_m, round_up(max(widest, 2 * lod_m))))
@@ -247,7 +256,7 @@ def histogram_picture(compared: Compared) -> Picture:
 
 def sampled(path: Path) -> NDArray[Any]:
     """Return the values (N,) of a regular sample of all cells of a raster, read by windows."""
-    frame = frame_of(path)
+    frame = raster_frame(path)
     step = max(int(np.ceil(np.sqrt(frame.rows * frame.columns / _MOST_SAMPLES))), 1)
     rows = range(0, frame.rows, WINDOW_PX)
     parts = []
@@ -267,7 +276,7 @@ def profile_facts(compared: Compared) -> tuple[ProfileFacts, ...]:
     return tuple(found)
 
 
-def profile_through(compared: Compared, polygon: Any) -> Profile:
+def profile_through(compared: Compared, polygon: Any) -> ChangeProfile:
     """Return the heights of both epochs, the later one after registration, along the longer axis of a polygon."""
     grid = compared.grid
     line = _line_through(polygon, grid.unit_m)
@@ -283,7 +292,7 @@ def profile_through(compared: Compared, polygon: Any) -> Profile:
     distance = np.linalg.norm(line - line[0], axis=1) * grid.unit_m
     inside = np.asarray(shapely.contains_xy(polygon, line[:, 0], line[:, 1]))
     later = np.where(np.isfinite(difference), heights[0] + difference, np.nan)
-    return Profile(distance, np.stack([heights[0], later]), np.stack(sigmas), inside_parts(distance, inside))
+    return ChangeProfile(distance, np.stack([heights[0], later]), np.stack(sigmas), inside_parts(distance, inside))
 
 
 def _line_through(polygon: Any, unit_m: float) -> FloatArray:
@@ -319,7 +328,7 @@ def orthophoto_facts(compared: Compared) -> PairFacts:
     frame, names = compared.reduced(), compared.names
     paths = [one.folder / "orthophoto.tif" for one in compared.grid.rasters]
     if not all(path.is_file() for path in paths):
-        return PairFacts(names, None, "One of the epochs has no orthophoto: `georef export-raster` makes it.", "")
+        return PairFacts(names, None, "One of the epochs has no orthophoto.", "")
     before, after = (picture_of(_on_grey(read_colours_onto(path, frame))) for path in paths)
     return PairFacts(names, (before, after), "", "Orthophotos of both epochs over the same area, north up.")
 

@@ -8,6 +8,7 @@ errors, and that of the whole exceeds 1.96 σ.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, find_objects, label
 from scipy.special import erfc
 
-from pipelines.change.detection import QUANTILE_95, Cells, Noise, Volume, volumes
-from pipelines.change.grid import CommonGrid, Window
+from pipelines.change.detection import QUANTILE_95, Cells, Noise, Volume, region_volumes
+from pipelines.change.grid import CommonGrid, GridWindow
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.formats.geotiff import cells_inside, outlines, read_cells, write_part
-from pipelines.survey.change_report import ChangedRegion
+from pipelines.survey.change_report import ChangedRegion, DoubtfulRegion
 
 CELLS = ("difference", "datum", "variance", "step")  # parts that volumes are made of
 _LEAST_REACH, _MOST_REACH = 2, 10  # cells
@@ -30,26 +31,26 @@ _CHANCE = 0.05  # that noise alone makes a region anywhere
 
 
 @dataclass(frozen=True)
-class Parts:
+class RasterParts:
     """Parts of the rasters, one a window, in a scratch folder."""
 
     folder: Path
     grid: CommonGrid
 
-    def path(self, name: str, window: Window) -> Path:
+    def path(self, name: str, window: GridWindow) -> Path:
         return self.folder / f"{name}_{window.row}_{window.column}.tif"
 
-    def write(self, name: str, window: Window, values: NDArray[Any]) -> None:
+    def write(self, name: str, window: GridWindow, values: NDArray[Any]) -> None:
         write_part(self.path(name, window), values[None], self.grid.part(window))
 
-    def cells(self, window: Window) -> Cells:
+    def cells(self, window: GridWindow) -> Cells:
         """Return the cells of a window after the registration, as volumes need them."""
         difference, datum, variance, step = (
             read_cells(self.path(name, window))[0].astype(np.float64) for name in CELLS
         )
         return Cells(difference, variance, datum, np.zeros(0), step, self.measured(window))
 
-    def measured(self, window: Window) -> BoolArray:
+    def measured(self, window: GridWindow) -> BoolArray:
         """Return which cells of a window both epochs have measured."""
         return np.asarray(read_cells(self.path("measured", window))[0] > 0)
 
@@ -58,7 +59,8 @@ class Parts:
 class FoundRegions:
     """Regions with their polygons in the CRS, those of the user first, and the sign (H, W) of cells in cores.
 
-    `lowered`, `raised` and `every` are the sums of those that were found.
+    `lowered`, `raised` and `every` are the sums of those that were found. `number` (H, W) is the place in
+    `regions`, counted from 1, of the region in whose core a cell lies; 0: in none.
     """
 
     regions: tuple[ChangedRegion, ...]
@@ -67,6 +69,17 @@ class FoundRegions:
     every: ChangedRegion
     polygons: list[Any]
     sign: NDArray[np.int8]
+    number: NDArray[np.int32]
+    volumes: tuple[Volume, ...]
+
+
+@dataclass(frozen=True)
+class DoubtfulRegions:
+    """Found regions that count as no change, with their polygons, and whether a cell (H, W) is in one's core."""
+
+    regions: tuple[DoubtfulRegion, ...]
+    polygons: list[Any]
+    inside: BoolArray
 
 
 def reach_of(grid: CommonGrid, noise: Noise) -> int:
@@ -105,7 +118,7 @@ def is_real(net_m3: FloatArray, sigma_m3: FloatArray, places: float) -> BoolArra
 
 
 def find_regions(
-    parts: Parts, sign: NDArray[np.int8], noise: Noise, given: tuple[Any, ...], min_area_m2: float
+    parts: RasterParts, sign: NDArray[np.int8], noise: Noise, given: tuple[Any, ...], min_area_m2: float
 ) -> FoundRegions:
     """Return the regions of the given polygons, then those found in significant cells of `sign` (H, W)."""
     grid = parts.grid
@@ -119,14 +132,14 @@ def find_regions(
         cells = parts.cells(window)
         inside = number[window.slices]
         core = np.where(sign[window.slices] != 0, inside, 0)
-        of_window = volumes(inside, cells, count), volumes(core, cells, count)
+        of_window = region_volumes(inside, cells, count), region_volumes(core, cells, count)
         whole, cores = (
             [one + two for one, two in zip(sums, more, strict=True)]
             for sums, more in zip((whole, cores), of_window, strict=True)
         )
         for place, polygon in enumerate(given):
-            of_given[place] += volumes(cells_inside(polygon, grid.part(window)).astype(np.int64), cells, 1)[0]
-    named = [(f"P{place}", volume) for place, volume in enumerate(of_given, start=1)]
+            of_polygon = cells_inside(polygon, grid.part(window)).astype(np.int64)
+            of_given[place] += region_volumes(of_polygon, cells, 1)[0]
     polygons = list(given)
     net, sigma, net_of_core, sigma_of_core = (
         np.array(values)
@@ -141,14 +154,69 @@ def find_regions(
     kept = np.flatnonzero(is_real(net_of_core, sigma_of_core, errors) & (np.abs(net) > QUANTILE_95 * sigma))
     kept = kept[np.argsort(-np.abs(net[kept]), kind="stable")]
     places = find_objects(number)
-    for place, index in enumerate(kept.tolist(), start=1):
-        named.append((f"R{place}", whole[index]))
+    for index in kept.tolist():
         polygons.append(_outline(number, index + 1, places[index], grid))
-    for name, chosen in (("lowered", kept[net[kept] < 0]), ("raised", kept[net[kept] > 0]), ("every", kept)):
-        named.append((name, sum((whole[index] for index in chosen.tolist()), Volume())))
-    *regions, lowered, raised, every = (_region_of(name, volume, noise, grid.cell_m2) for name, volume in named)
-    in_cores = np.where(np.isin(number, kept + 1), sign, 0).astype(np.int8)
-    return FoundRegions(tuple(regions), lowered, raised, every, polygons, in_cores)
+    of_place = np.zeros(count + 1, dtype=np.int32)
+    of_place[kept + 1] = len(given) + 1 + np.arange(len(kept))
+    in_cores = np.where(sign != 0, of_place[number], 0).astype(np.int32)
+    every = (*of_given, *(whole[index] for index in kept.tolist()))
+    return _named(
+        every,
+        polygons,
+        given=len(given),
+        sign=np.where(in_cores > 0, sign, 0),
+        number=in_cores,
+        noise=noise,
+        cell_m2=grid.cell_m2,
+    )
+
+
+def without(
+    found: FoundRegions, doubtful: Collection[int], reason: str, noise: Noise, cell_m2: float
+) -> tuple[FoundRegions, DoubtfulRegions]:
+    """Return regions without those at some places of `found`, and these, which count as no change for a reason."""
+    out = sorted(doubtful)
+    kept = [place for place in range(len(found.regions)) if place not in doubtful]
+    moved = np.zeros(len(found.regions) + 1, dtype=np.int32)
+    moved[np.array(kept, dtype=np.int64) + 1] = 1 + np.arange(len(kept))
+    number, inside = moved[found.number], np.isin(found.number, np.array(out, dtype=np.int64) + 1)
+    left = _named(
+        tuple(found.volumes[place] for place in kept),
+        [found.polygons[place] for place in kept],
+        given=sum(found.regions[place].name.startswith("P") for place in kept),
+        sign=np.where(number > 0, found.sign, 0),
+        number=number,
+        noise=noise,
+        cell_m2=cell_m2,
+    )
+    regions = tuple(
+        DoubtfulRegion(**found.regions[place].model_dump() | {"name": f"D{rank}"}, reason=reason)
+        for rank, place in enumerate(out, start=1)
+    )
+    return left, DoubtfulRegions(regions, [found.polygons[place] for place in out], inside)
+
+
+def _named(
+    every: tuple[Volume, ...],
+    polygons: list[Any],
+    *,
+    given: int,
+    sign: IntArray | NDArray[np.int8],
+    number: NDArray[np.int32],
+    noise: Noise,
+    cell_m2: float,
+) -> FoundRegions:
+    """Return regions by their volumes, of which the first are those of `given` polygons, with the others' sums."""
+    of_found = every[given:]
+    names = [*(f"P{place + 1}" for place in range(given)), *(f"R{place + 1}" for place in range(len(of_found)))]
+    sums = {
+        "lowered": [one for one in of_found if one.fill < one.cut],
+        "raised": [one for one in of_found if one.fill > one.cut],
+        "every": list(of_found),
+    }
+    lowered, raised, total = (region_of(name, sum(parts, Volume()), noise, cell_m2) for name, parts in sums.items())
+    regions = tuple(region_of(name, one, noise, cell_m2) for name, one in zip(names, every, strict=True))
+    return FoundRegions(regions, lowered, raised, total, polygons, sign.astype(np.int8), number, every)
 
 
 def _outline(number: IntArray | NDArray[np.int32], which: int, place: tuple[slice, slice], grid: CommonGrid) -> Any:
@@ -158,7 +226,7 @@ def _outline(number: IntArray | NDArray[np.int32], which: int, place: tuple[slic
     return shapely.union_all(outlines(cells, frame))
 
 
-def _region_of(name: str, volume: Volume, noise: Noise, cell_m2: float) -> ChangedRegion:
+def region_of(name: str, volume: Volume, noise: Noise, cell_m2: float) -> ChangedRegion:
     """Return the record of a region from the sums of its cells."""
     return ChangedRegion(
         name=name,

@@ -16,13 +16,12 @@ from pipelines.core.stages import GAUSSIANS, MODEL
 from pipelines.core.types import ByteArray, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.geotiff import sampled_raster
-from pipelines.geodesy.enu import Origin, ecef_from_enu_rotation, ecef_from_lla, enu_from_ecef, lla_of
+from pipelines.geodesy.enu import Origin, ecef_from_enu_rotation, ecef_from_lla, lla_of
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.geometry.similarity import Similarity
-from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import TrainedSurvey, load_trained
+from pipelines.surface.surface_views import ModelRenderer, model_renderer
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.solution import read_sfm, read_trained
 
 _RENDER_PX = 960
 
@@ -42,13 +41,6 @@ def ecef_from_geo(origin: Origin) -> Similarity:
     return Similarity(1.0, ecef_from_enu_rotation(lla), ecef_from_lla(lla))
 
 
-def later_from_earlier(before: TrainedSurvey, after: TrainedSurvey) -> Similarity:
-    """Return the similarity from `model` of the earlier epoch to `model` of the later one."""
-    ecef_from_before = ecef_from_geo(before.survey.origin_on_earth) @ before.geo_from_model
-    ecef_from_after = ecef_from_geo(after.survey.origin_on_earth) @ after.geo_from_model
-    return ecef_from_after.inverse() @ ecef_from_before
-
-
 def moved_pose(pose: ViewPose, to_from_from: Similarity) -> ViewPose:
     """Return a camera in another frame, by the similarity to that frame."""
     rotation = pose.cam_from_model @ to_from_from.rotation.T
@@ -58,21 +50,24 @@ def moved_pose(pose: ViewPose, to_from_from: Similarity) -> ViewPose:
 def render_pair(
     workspaces: tuple[Workspace, Workspace], grid: CommonGrid, plan: tuple[float, float], progress: Progress
 ) -> RenderPair | str:
-    """Return renders from the camera that looks at a place (east, north) in the CRS; or why there are none."""
+    """Return renders from the camera that looks at a place (east, north) in the CRS; or why there are none.
+
+    Raises as `read_trained`, `read_sfm` and `model_renderer`.
+    """
     for workspace in workspaces:
         if not (workspace.has(MODEL) and workspace.has(GAUSSIANS)):
             return f"{workspace.root.name} has no trained model."
-    before = load_trained(workspaces[0])
-    renderer = _renderer(before, workspaces[0], progress)
-    poses = [renderer.pose(index) for index in before.indices("train")]
-    best = nearest_to_middle(poses, _in_model(before, grid, plan))
+    renderer, ecef_from_before = _renderer(workspaces[0], progress)
+    cameras = renderer.model.indices("train")
+    poses = [renderer.pose(index) for index in cameras]
+    best = nearest_to_middle(poses, ecef_from_before.inverse().apply(_in_ecef(grid, plan))[0])
     if best is None:
         return "No photograph of the earlier epoch shows the middle of the change."
     pose = ViewPose(_small(poses[best].pinhole), poses[best].cam_from_model, poses[best].center_in_model)
     first = _pixels(renderer, pose)
-    after = load_trained(workspaces[1])
-    second = _pixels(_renderer(after, workspaces[1], progress), moved_pose(pose, later_from_earlier(before, after)))
-    return RenderPair(before.model.cameras[before.indices("train")[best]].name, first, second)
+    later, ecef_from_after = _renderer(workspaces[1], progress)
+    second = _pixels(later, moved_pose(pose, ecef_from_after.inverse() @ ecef_from_before))
+    return RenderPair(renderer.model.cameras[cameras[best]].name, first, second)
 
 
 def nearest_to_middle(poses: list[ViewPose], point_in_model: FloatArray) -> int | None:
@@ -89,21 +84,21 @@ def nearest_to_middle(poses: list[ViewPose], point_in_model: FloatArray) -> int 
     return min(found)[1] if found else None
 
 
-def _in_model(before: TrainedSurvey, grid: CommonGrid, plan: tuple[float, float]) -> FloatArray:
-    """Return a place (3,) in `model` of the earlier epoch of a place in the CRS, on the earlier surface."""
+def _in_ecef(grid: CommonGrid, plan: tuple[float, float]) -> FloatArray:
+    """Return a place (1, 3) in EPSG:4978 of a place in the CRS, on the earlier surface."""
     one = grid.rasters[0]
     height = sampled_raster(one.folder / one.names[0], np.array([plan]))
     if not np.isfinite(height[0]):
         height = np.array([one.sidecar.bounds[0][2]])
-    lla = grid.crs.lla_from_xyz(np.column_stack([[plan], height]))
-    in_geo = enu_from_ecef(ecef_from_lla(lla), before.survey.origin_on_earth)
-    return np.asarray(before.geo_from_model.inverse().apply(in_geo)[0])
+    return ecef_from_lla(grid.crs.lla_from_xyz(np.column_stack([[plan], height])))
 
 
-def _renderer(trained: TrainedSurvey, workspace: Workspace, progress: Progress) -> ModelRenderer:
-    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-    backend = rasterizer("auto", progress, mip_filter=trained.model.mip_filter)
-    return ModelRenderer(trained, images, backend)
+def _renderer(workspace: Workspace, progress: Progress) -> tuple[ModelRenderer, Similarity]:
+    """Return the renderer of an epoch's model, and the similarity from its frame `model` to EPSG:4978."""
+    model = read_trained(workspace)
+    sfm, survey = read_sfm(workspace, model), load_survey(workspace)
+    renderer = model_renderer(workspace, model, sfm, survey, progress=progress)
+    return renderer, ecef_from_geo(survey.origin_on_earth) @ model.similarity
 
 
 def _small(pinhole: Pinhole) -> Pinhole:

@@ -5,8 +5,8 @@ Reads the rasters, surveys and adjustments of both workspaces. Writes `change/` 
 page `change.html`; on request `along_normals.laz`.
 """
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,46 +15,54 @@ import shapely
 from numpy.typing import NDArray
 
 from pipelines.change.along_normals import Datum, change_along_normals, require_clouds
+from pipelines.change.by_date import Ground, volumes_by_date
 from pipelines.change.datum import load_epoch, shared_by
 from pipelines.change.detection import (
     QUANTILE_95,
-    Cells,
     Noise,
     level_of_detection,
     significant_change,
     unchanged_ground,
 )
-from pipelines.change.grid import CommonGrid, EpochRasters, Window, epoch_rasters
+from pipelines.change.grid import (
+    DOUBTFUL,
+    LOWERED,
+    RAISED,
+    UNCHANGED,
+    CommonGrid,
+    EpochRasters,
+    epoch_rasters,
+)
 from pipelines.change.options import ChangeOptions
 from pipelines.change.page import Compared, change_page
-from pipelines.change.regions import Parts, find_regions, reach_of
-from pipelines.change.tied import Tied, contradicted, tied_by
+from pipelines.change.regions import DoubtfulRegions, FoundRegions, RasterParts, find_regions, reach_of, without
+from pipelines.change.tied import Contradicted, Surfaces, Tied, contradicted, tied_by
 from pipelines.core.errors import InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, save_json, union
 from pipelines.core.sentences import listed
 from pipelines.core.stages import CHANGE_PAGE
 from pipelines.core.staleness import status
-from pipelines.core.types import vector3
+from pipelines.core.types import BoolArray, vector3
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.formats.geotiff import Band, RasterKind, write_mosaic
+from pipelines.formats.geotiff import Band, RasterKind, sampled_raster, write_mosaic
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import feature, features_text, write_polygons_gpkg
 from pipelines.geodesy.crs import parse_crs
 from pipelines.report.page import render_page
 from pipelines.survey.boundaries import Outlines, read_outlines
-from pipelines.survey.change_report import Change, ChangedRegion, Registration
+from pipelines.survey.change_report import Change, ChangedRegion, EpochShift, RegionAtDate
 
 _PLACES = 20  # along each side of the rasters, which stand for the survey
 _ROOM = __name__.rpartition(".")[0]
 _MOST_LEVELS = 1_000_000  # of detection, whose median is stated
-LOWERED, UNCHANGED, RAISED = 2, 1, 3  # in significant.tif; 0: not measured in both
+DOUBTED = "region-contradicted"  # reason of doubtful regions, and code of their warning
 _KINDS = {
     "difference": RasterKind("float32", (Band("later minus earlier height", "metre"),)),
     "sigma": RasterKind("float32", (Band("standard deviation of the difference", "metre"),)),
     "lod": RasterKind("float32", (Band("level of detection at 95 %", "metre"),)),
     "significant": RasterKind(
-        "uint8", (Band("1 no significant change, 2 lowered, 3 raised; 0 not measured in both"),)
+        "uint8", (Band("1 no significant change, 2 lowered, 3 raised, 4 doubtful; 0 not measured in both"),)
     ),
 }
 
@@ -71,7 +79,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     epochs = load_epoch(workspaces[0]), load_epoch(workspaces[1])
     if options.along_normals:
         require_clouds(workspaces)
-    registered = options.stable is not None or options.stable_auto
+    registered = options.is_registered
     tied, solved_again = tied_by(epochs, workspaces)
     for one, workspace in zip(epochs, workspaces, strict=True):
         if one.grid is None and not registered and tied is None:
@@ -79,22 +87,27 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
             raise InputError("datum-not-known", message, path=workspace.root)
     shared = shared_by(epochs[0].survey, epochs[1].survey, same_base=options.same_base)
     area = _polygons(options.boundary, "--boundary", after, options)
-    grid = CommonGrid((before, after), epochs, shared, None if area is None else shapely.union_all(area), tied)
+    inside = None if area is None else shapely.union_all(area)
+    grid = CommonGrid((before, after), epochs, shared, inside, tied)
     stable = _polygons(options.stable, "--stable", after, options)
     ground = None if stable is None else shapely.union_all(stable)
     noise = unchanged_ground(
         grid.samples(ground, stage.progress), grid.cell_m, grid.datum_h_m, with_tilt=options.tilt
     )
     registration = _registration_of(noise, applied=registered, datum_v_m=grid.datum_v_m)
-    parts = Parts(stage.out / "parts", grid)
+    parts = RasterParts(stage.out / "parts", grid)
     sign, median_lod_m = _write_rasters(stage, parts, noise, registered=registered)
     given = _polygons(options.regions, "--regions", after, options) or ()
     found = find_regions(parts, sign, noise, given, options.min_area)
-    _write_significant(stage.out, parts, found.sign)
+    found, doubtful, partly = _without_doubtful(found, tied, noise, parts)
+    _write_significant(stage.out, parts, found.sign, doubtful.inside)
     moved = None
     if options.along_normals:
         datum = Datum(grid, noise, registered)
         moved = change_along_normals(workspaces, datum, options.reach, stage.out, stage.progress)
+    where = Ground(grid.crs, inside, ground)
+    by_date, left_out = ((), ()) if tied is None else volumes_by_date(tied, found, where, options, stage.progress)
+    significant, doubted = int((found.sign != 0).sum()), int(doubtful.inside.sum())
     change = Change(
         of=options.of,
         crs=after.sidecar.crs,
@@ -103,34 +116,37 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
         shared_control_points=shared.control,
         shared_sigma_v_m=float(np.sqrt(shared.by_control_m2[2] + shared.by_base_m2[2])),
         median_lod_m=median_lod_m,
-        significant_share=float((found.sign != 0).mean()),
+        significant_share=significant / found.sign.size,
+        doubtful_share=doubted / max(significant + doubted, 1),
         lowered=found.lowered,
         raised=found.raised,
         found=found.every,
         regions=found.regions,
+        doubtful=doubtful.regions,
         along_normals=moved,
         common=None if tied is None else tied.common,
+        by_date=by_date,
     )
     save_json(change, stage.out / "change.json")
-    _write_vectors(stage.out, change, found.polygons, grid)
+    _write_vectors(stage.out, change, found.polygons, doubtful.polygons, grid)
     if tied is not None:
         _write_common(stage.out, tied)
     remove(parts.folder)
     cautions = tuple(one.cautions for one in epochs)
     stale = tuple(remark for one in workspaces for remark in _stale_rasters(one))
-    doubted = () if tied is None else _doubted(contradicted(tied, found.regions, found.polygons, grid.crs))
-    summary = _summary(change, (*stale, *solved_again, *doubted), union(*cautions))
-    compared = Compared(stage.out, change, found.polygons, grid, workspaces, tied)
+    warnings = (*stale, *solved_again, *left_out, *_doubted(change, found, doubtful, partly))
+    summary = _summary(change, warnings, union(*cautions))
+    compared = Compared(stage.out, change, found.polygons, grid, workspaces, tied, doubtful.polygons)
     page = change_page(compared, summary.warnings, cautions, stage.progress)
     replace_text(stage.out / Path(CHANGE_PAGE).name, render_page(page, _ROOM))
     return summary
 
 
-def _registration_of(noise: Noise, *, applied: bool, datum_v_m: float) -> Registration:
+def _registration_of(noise: Noise, *, applied: bool, datum_v_m: float) -> EpochShift:
     """Return the record of a registration; `datum_v_m` is the σ of a vertical shift by both adjustments."""
     sigma = np.sqrt(np.diag(noise.shift_cov_m2))
     limit = QUANTILE_95 * float(np.hypot(datum_v_m, np.hypot(sigma[2], noise.long_range_m)))
-    return Registration(
+    return EpochShift(
         applied=applied,
         shift_m=vector3(noise.shift_m),
         sigma_shift_m=vector3(sigma),
@@ -150,9 +166,9 @@ def _stale_rasters(workspace: Workspace) -> Iterator[Remark]:
     """Yield a warning if the rasters of an epoch are older than the survey and the adjustment beside them."""
     for row in status(workspace):
         if row.stage == "export-raster" and row.state in ("stale", "damaged"):
-            sentence = f"The rasters of {workspace.root.name} are {row.state} ({row.reason}). "
-            sentence += f"`georef export-raster {workspace.root}` makes them again."
-            yield Remark(code="epoch-stale", sentence=sentence)
+            sentence = f"The rasters of {workspace.root.name} are {row.state} ({row.reason})."
+            remedy = f"`georef export-raster {workspace.root}` makes them again."
+            yield Remark(code="epoch-stale", sentence=sentence, remedy=remedy)
 
 
 def _summary(change: Change, warnings: tuple[Remark, ...], cautions: tuple[Remark, ...]) -> Summary:
@@ -162,11 +178,16 @@ def _summary(change: Change, warnings: tuple[Remark, ...], cautions: tuple[Remar
     if registration.contradicts:
         sentence = (
             f"Unchanged ground lies {registration.shift_m[2]:+.3f} m apart in the epochs, more than the datum's σ "
-            f"of {registration.datum_sigma_v_m:.3f} m explains. Register with --stable FILE or --stable-auto"
+            f"of {registration.datum_sigma_v_m:.3f} m explains."
+        )
+        remedy = (
+            "Register with --stable FILE or --stable-auto"
             f"{'' if change.common is not None else ', or tie the later epoch to the earlier (sfm --earlier)'}."
         )
-        warnings = (*warnings, Remark(code="epochs-shifted", sentence=sentence))
+        warnings = (*warnings, Remark(code="epochs-shifted", sentence=sentence, remedy=remedy))
     figure = f"{len(found)} regions, {cut:.1f} m³ cut, {fill:.1f} m³ fill, "
+    if change.doubtful:
+        figure += f"{len(change.doubtful)} doubtful, "
     figure += f"shift {registration.shift_m[2]:+.3f} ± {registration.sigma_shift_m[2]:.3f} m "
     figure += "applied" if registration.applied else "seen on unchanged ground, not applied"
     if change.common is not None:
@@ -183,6 +204,9 @@ def _summary(change: Change, warnings: tuple[Remark, ...], cautions: tuple[Remar
         "correlated_m2": registration.correlated_m2,
         "common": None if change.common is None else change.common.model_dump(),
         "significant_share": change.significant_share,
+        "doubtful_regions": len(change.doubtful),
+        "doubtful_share": change.doubtful_share,
+        "by_date": [one.model_dump() for one in change.by_date],
     }
     return Summary(figure, values, warnings, cautions)
 
@@ -213,17 +237,8 @@ def _polygons(path: Path | None, field: str, after: EpochRasters, options: Chang
     return tuple(part for one in found for part in moved(one))
 
 
-def _registered(cells: Cells, grid: CommonGrid, window: Window, noise: Noise, *, registered: bool) -> Cells:
-    """Return cells after the registration, with the σ that their neighbours share."""
-    if not registered:
-        return replace(cells, datum_m=np.maximum(cells.datum_m, noise.long_range_m))
-    moved = noise.moved_by(cells.slope, grid.place_m(window))
-    datum = np.hypot(np.sqrt(noise.shift_cov_m2[2, 2]), noise.long_range_m)
-    return replace(cells, difference_m=cells.difference_m - moved, datum_m=np.full(cells.difference_m.shape, datum))
-
-
 def _write_rasters(
-    stage: StageRun, parts: Parts, noise: Noise, *, registered: bool
+    stage: StageRun, parts: RasterParts, noise: Noise, *, registered: bool
 ) -> tuple[NDArray[np.int8], float]:
     """Write the rasters, keep their parts, and return the sign of all changes and the median level of detection."""
     grid, reach = parts.grid, reach_of(parts.grid, noise)
@@ -233,7 +248,7 @@ def _write_rasters(
     with stage.progress.task("windows", len(windows)) as task:
         for window in windows:
             wide, own = grid.around(window, reach)
-            cells = _registered(grid.cells(wide), grid, wide, noise, registered=registered)
+            cells = grid.registered(wide, noise, applied=registered)
             lod = level_of_detection(cells, noise.factor)
             sign[window.slices] = significant_change(cells, noise.factor, reach)[own]
             known = np.isfinite(cells.difference_m[own])
@@ -256,28 +271,68 @@ def _write_rasters(
     return sign, float(np.median(np.concatenate(levels)))
 
 
-def _write_significant(folder: Path, parts: Parts, sign: NDArray[np.int8]) -> None:
+def _write_significant(folder: Path, parts: RasterParts, sign: NDArray[np.int8], doubtful: BoolArray) -> None:
     for window in parts.grid.windows():
         change = sign[window.slices]
-        classes = np.select([~parts.measured(window), change < 0, change > 0], [0, LOWERED, RAISED], UNCHANGED)
+        cases = [~parts.measured(window), doubtful[window.slices], change < 0, change > 0]
+        classes = np.select(cases, [0, DOUBTFUL, LOWERED, RAISED], UNCHANGED)
         parts.write("significant", window, classes.astype(np.uint8))
     _write_mosaic(folder, parts, "significant")
 
 
-def _write_mosaic(folder: Path, parts: Parts, name: str) -> None:
+def _write_mosaic(folder: Path, parts: RasterParts, name: str) -> None:
     places = [(parts.path(name, window), window.column, window.row) for window in parts.grid.windows()]
     write_mosaic(folder / f"{name}.tif", places, parts.grid.frame, _KINDS[name], {})
 
 
-def _doubted(names: list[str]) -> tuple[Remark, ...]:
-    """Return the warning of regions that their own points in common contradict; none without."""
-    if not names:
-        return ()
-    sentence = (
-        f"In {listed(names)}, points in common lie where they lay at the other date, although the surfaces differ: "
-        "one of both is wrong there. Compare the photographs before you count the volume."
-    )
-    return (Remark(code="region-contradicted", sentence=sentence),)
+def _without_doubtful(
+    found: FoundRegions, tied: Tied | None, noise: Noise, parts: RasterParts
+) -> tuple[FoundRegions, DoubtfulRegions, list[str]]:
+    """Return the regions that count, those that points in common contradict, and the names of those in a part."""
+    contradicts, grid = Contradicted(), parts.grid
+    if tied is not None:
+        risen_m = partial(sampled_raster, parts.folder.parent / "difference.tif")
+        surfaces = Surfaces(grid.crs, risen_m, noise.length_m)
+        contradicts = contradicted(tied, found.regions, found.polygons, surfaces)
+    kept = [place for place in range(len(found.regions)) if place not in contradicts.whole]
+    left, doubtful = without(found, contradicts.whole, DOUBTED, noise, grid.cell_m2)
+    partly = [one.name for one, place in zip(left.regions, kept, strict=True) if place in contradicts.part]
+    return left, doubtful, partly
+
+
+def _doubted(change: Change, found: FoundRegions, doubtful: DoubtfulRegions, partly: list[str]) -> Iterator[Remark]:
+    """Yield the warnings of regions that points in common contradict as a whole, or in a part."""
+    if doubtful.regions:
+        names = [region.name for region in doubtful.regions]
+        given = [
+            region.name
+            for region, polygon in zip(found.regions, found.polygons, strict=True)
+            if region.name.startswith("P") and shapely.union_all(doubtful.polygons).intersects(polygon)
+        ]
+        net_m3 = sum(region.net_m3 for region in doubtful.regions)
+        sentence = (
+            f"{listed(names)} of {net_m3:+.1f} m³, {change.doubtful_share:.0%} of the cells that differ, are "
+            "doubtful and count as no change: points in common lie where they lay at the other date, although the "
+            "surfaces differ there. One of both surfaces is wrong. Compare the photographs."
+        )
+        if given:
+            sentence += f" The volumes of {listed(given)} count a part of it."
+        yield Remark(code=DOUBTED, sentence=sentence)
+    if partly:
+        sentence = (
+            f"In a part of {listed(partly)}, points in common lie where they lay at the other date, although the "
+            "surfaces differ. Compare the photographs before you count the volume."
+        )
+        yield Remark(code="region-partly-contradicted", sentence=sentence)
+
+
+def _rows_by_date(change: Change) -> list[list[Any]]:
+    """Return the head and the lines of the table of volumes by date."""
+    of_region = [name if name != "name" else "region" for name in RegionAtDate.model_fields]
+    rows: list[list[Any]] = [["date", "taken_on", "sigma_v_m", *of_region]]
+    for date in change.by_date:
+        rows += [[date.name, date.taken_on, date.sigma_v_m, *one.model_dump().values()] for one in date.regions]
+    return rows
 
 
 def _write_common(folder: Path, tied: Tied) -> None:
@@ -293,17 +348,32 @@ def _write_common(folder: Path, tied: Tied) -> None:
     replace_text(folder / "common_points.geojson", features_text(features))
 
 
-def _write_vectors(folder: Path, change: Change, polygons: list[Any], grid: CommonGrid) -> None:
+def _write_vectors(
+    folder: Path, change: Change, polygons: list[Any], doubtful: list[Any], grid: CommonGrid
+) -> None:
+    """Write the regions and the doubtful ones with their polygons, and the table of volumes by date."""
+    _write_geojson(folder / "regions.geojson", change.regions, polygons, grid)
+    if doubtful:
+        _write_geojson(folder / "doubtful.geojson", change.doubtful, doubtful, grid)
+    if change.by_date:
+        replace_text(folder / "by_date.csv", table_text(_rows_by_date(change)))
+    rows = [region.model_dump() for region in change.regions]
+    write_polygons_gpkg(folder / "regions.gpkg", "regions", polygons, rows, grid.frame.wkt)
+    heads = list(ChangedRegion.model_fields)
+    replace_text(folder / "regions.csv", table_text([heads, *([row[name] for name in heads] for row in rows)]))
+
+
+def _write_geojson(path: Path, regions: Sequence[ChangedRegion], polygons: list[Any], grid: CommonGrid) -> None:
+    """Write regions with their polygons, which are in the CRS of the grid, in WGS84."""
+
     def in_wgs84(plan: NDArray[Any]) -> NDArray[Any]:
         lla = grid.crs.lla_from_xyz(np.column_stack([plan, np.zeros(len(plan))]))
         return np.round(lla[:, [1, 0]], 8)
 
-    rows = [region.model_dump() for region in change.regions]
     features = [
-        feature(shapely.geometry.mapping(shapely.orient_polygons(shapely.transform(one, in_wgs84))), row)
-        for one, row in zip(polygons, rows, strict=True)
+        feature(
+            shapely.geometry.mapping(shapely.orient_polygons(shapely.transform(one, in_wgs84))), region.model_dump()
+        )
+        for one, region in zip(polygons, regions, strict=True)
     ]
-    replace_text(folder / "regions.geojson", features_text(features))
-    write_polygons_gpkg(folder / "regions.gpkg", "regions", polygons, rows, grid.frame.wkt)
-    heads = list(ChangedRegion.model_fields)
-    replace_text(folder / "regions.csv", table_text([heads, *([row[name] for name in heads] for row in rows)]))
+    replace_text(path, features_text(features))

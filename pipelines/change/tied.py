@@ -6,7 +6,7 @@ the one before it may cancel in the next step: the sum is no less than the truth
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -29,7 +29,7 @@ from pipelines.survey.common_points import CommonPoints, solution_hash
 
 _MOST_DATES = 30
 _LEAST_INSIDE = 3  # points in common in a region, of which one may be wrong
-_STILL = 0.5  # of the mean change of a region: points that moved less have not moved with it
+_HALF = 0.5  # of a change: a point that moved less has not moved with it; of a region: more is the whole
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,55 @@ class Step:
     grid: AccuracyGrid
     spread: float
 
+    @property
+    def lla(self) -> FloatArray:
+        """Points in common (J, 3) as latitude, longitude, height."""
+        return lla_from_enu(self.relative.position_in_geo, self.epoch.survey.origin_on_earth)
+
+
+@dataclass(frozen=True)
+class Dated:
+    """Workspace of a date, and its epoch."""
+
+    workspace: Workspace
+    epoch: Epoch
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Difference of the surfaces of two epochs.
+
+    Attributes:
+        risen_m: returns the differences (N,) at places (N, 2) in the CRS; NaN: not known.
+        length_m: over which errors of the surfaces are correlated.
+    """
+
+    crs: PointCrs
+    risen_m: Callable[[FloatArray], FloatArray]
+    length_m: float
+
+
+@dataclass(frozen=True)
+class Contradicted:
+    """Regions by their places in a list: those that points in common contradict as a whole, and in a part."""
+
+    whole: tuple[int, ...] = ()
+    part: tuple[int, ...] = ()
+
 
 @dataclass(frozen=True)
 class Tied:
-    """Steps from one epoch to another, at least one."""
+    """Steps from one epoch to another, at least one, in order.
+
+    `dates` are the epochs that they lead along; empty where both epochs were tied to a third, older one.
+    """
 
     steps: tuple[Step, ...]
+    dates: tuple[Dated, ...] = ()
+
+    def between(self, first: int, last: int) -> Tied:
+        """Return the steps between two of the dates."""
+        return Tied(self.steps[first:last], self.dates[first : last + 1])
 
     def variance_at(self, crs: PointCrs, plan: FloatArray) -> FloatArray:
         """Return the variances (N, 3) east, north and up in m² of the difference at places (N, 2) in a CRS."""
@@ -69,10 +112,7 @@ class Tied:
 
     def lla(self) -> FloatArray:
         """Return the points in common of all steps (J, 3) as latitude, longitude, height."""
-        parts = [
-            lla_from_enu(step.relative.position_in_geo, step.epoch.survey.origin_on_earth) for step in self.steps
-        ]
-        return np.concatenate(parts)
+        return np.concatenate([step.lla for step in self.steps])
 
     @property
     def used(self) -> BoolArray:
@@ -84,21 +124,45 @@ class Tied:
         return np.concatenate([step.relative.missed_m for step in self.steps])
 
 
-def contradicted(tied: Tied, regions: Sequence[ChangedRegion], polygons: Sequence[Any], crs: PointCrs) -> list[str]:
-    """Return the names of found regions in which points in common lie where they lay at the other date.
+def contradicted(
+    tied: Tied,
+    regions: Sequence[ChangedRegion],
+    polygons: Sequence[Any],
+    surfaces: Surfaces,
+) -> Contradicted:
+    """Return which found regions points in common contradict, in each step between the epochs.
 
-    Photographs show the same marks in the same places then: one of both surfaces is wrong. Polygons are in the plan
-    of the CRS.
+    A point is a witness where the surfaces differ by half of the region's mean change at least: not at its rim. A
+    witness contradicts if it has moved by less than half of that difference: photographs of both dates show the
+    same marks in the same place. It speaks for the ground around it over which errors of a surface are correlated.
+    Polygons are in the plan of the CRS.
     """
-    plan, used, up_m = crs.xyz_from_lla(tied.lla())[:, :2], tied.used, tied.missed_m[:, 2]
-    found = []
-    for region, polygon in zip(regions, polygons, strict=True):
-        inside = used & shapely.contains_xy(polygon, plan[:, 0], plan[:, 1])
-        if not region.name.startswith("R") or inside.sum() < _LEAST_INSIDE:
+    whole, part = [], []
+    for place, (region, polygon) in enumerate(zip(regions, polygons, strict=True)):
+        if not region.name.startswith("R"):
             continue
-        if abs(float(np.median(up_m[inside]))) < _STILL * abs(region.net_m3) / region.area_m2:
-            found.append(region.name)
-    return found
+        least_m = _HALF * abs(region.net_m3) / region.area_m2
+        shares = [_contradicted_share(step, polygon, surfaces, least_m) for step in tied.steps]
+        if min(shares) >= _HALF:
+            whole.append(place)
+        elif min(shares) > 0:
+            part.append(place)
+    return Contradicted(tuple(whole), tuple(part))
+
+
+def _contradicted_share(step: Step, polygon: Any, surfaces: Surfaces, least_m: float) -> float:
+    """Return the share of a polygon for which points speak that have not moved; 0: too few, or outvoted."""
+    plan = surfaces.crs.xyz_from_lla(step.lla)[:, :2]
+    inside = shapely.contains_xy(polygon, plan[:, 0], plan[:, 1])
+    plan, used, up_m = plan[inside], step.relative.used[inside], np.abs(step.relative.missed_m[inside, 2])
+    differs_m = np.abs(surfaces.risen_m(plan))
+    witness, stands = differs_m >= least_m, up_m < _HALF * differs_m
+    still = witness & stands & used
+    # A point that has moved disagrees with the others and is not used; as a witness it counts all the same.
+    if still.sum() < _LEAST_INSIDE or still.sum() <= (witness & ~stands).sum():
+        return 0.0
+    ground = shapely.MultiPoint(plan[still]).buffer(surfaces.length_m / surfaces.crs.horizontal_unit)
+    return float(ground.intersection(polygon).area / polygon.area)
 
 
 def tied_by(
@@ -111,7 +175,7 @@ def tied_by(
     Raises:
         GeorefError: an epoch between them cannot be read.
     """
-    known = {one.root.resolve(): epoch for one, epoch in zip(workspaces, epochs, strict=True)}
+    known = {one.root.resolve(): Dated(one, epoch) for one, epoch in zip(workspaces, epochs, strict=True)}
     lines = [_earlier_dates(one, workspaces) for one in workspaces]
     hashes = [[solution_hash(date) for date in line] for line in lines]
     meeting = next((one for one in hashes[1] if one in hashes[0]), None)
@@ -120,14 +184,24 @@ def tied_by(
             _solved_again(*workspaces[::order]) for order in (1, -1) if _is_older(*workspaces[::order])
         )
         return None, warnings
-    steps = []
-    for line, of_line in zip(lines, hashes, strict=True):
-        for later, earlier in pairwise(line[: of_line.index(meeting) + 1]):
-            step = _step(*(known.get(one.root.resolve()) or load_epoch(one) for one in (later, earlier)))
-            if step is None:
-                return None, ()
-            steps.append(step)
-    return (Tied(tuple(steps)) if steps else None), ()
+
+    def dated(workspace: Workspace) -> Dated:
+        key = workspace.root.resolve()
+        if key not in known:
+            known[key] = Dated(workspace, load_epoch(workspace))
+        return known[key]
+
+    ways = [
+        [dated(one) for one in line[: of_line.index(meeting) + 1]]
+        for line, of_line in zip(lines, hashes, strict=True)
+    ]
+    down = [_step(later.epoch, earlier.epoch) for later, earlier in pairwise(ways[0])]
+    up = [_step(later.epoch, earlier.epoch) for later, earlier in pairwise(ways[1])][::-1]
+    steps = [step for step in (*down, *up) if step is not None]
+    if not steps or len(steps) < len(down) + len(up):
+        return None, ()
+    dates = () if down and up else (*ways[0], *ways[1][-2::-1])
+    return Tied(tuple(steps), dates), ()
 
 
 def _step(later: Epoch, earlier: Epoch) -> Step | None:
@@ -168,6 +242,7 @@ def _is_older(earlier: Workspace, later: Workspace) -> bool:
 def _solved_again(earlier: Workspace, later: Workspace) -> Remark:
     sentence = (
         f"{later.root.name} was tied to an older solution of {earlier.root.name}, which was solved or trained "
-        f"again since: the points in common do not count. `georef run {later.root}` ties it again."
+        f"again since: the points in common do not count."
     )
-    return Remark(code="earlier-solved-again", sentence=sentence)
+    remedy = f"`georef run {later.root}` ties it again."
+    return Remark(code="earlier-solved-again", sentence=sentence, remedy=remedy)

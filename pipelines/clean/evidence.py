@@ -40,7 +40,7 @@ class Evidence:
 
 def evidence_of(renderer: ModelRenderer, backend: Rasterizer, views: list[int], progress: Progress) -> Evidence:
     """Return the evidence of views, by their indices; an InputError: a photograph cannot be read."""
-    gaussians = renderer.trained.gaussians.to(backend.device)
+    gaussians = renderer.gaussians.to(backend.device)
     weight, error = torch.zeros(2, len(gaussians), device=backend.device)
     with progress.task("evidence of the views", len(views)) as task:
         for index in views:
@@ -59,8 +59,8 @@ def _pose(renderer: ModelRenderer, index: int) -> Tensor:
 
 def _error_by_opacity(renderer: ModelRenderer, backend: Rasterizer, index: int, pose: Tensor) -> Tensor:
     """Return opacity times the derivative of the squared error by it (N,), of one view."""
-    model = renderer.trained.model
-    shown = renderer.trained.gaussians.to(backend.device).detached()
+    model = renderer.model
+    shown = renderer.gaussians.to(backend.device).detached()
     shown.logit_opacities = shown.logit_opacities.clone().requires_grad_()
     photo, mask = (values.to(backend.device) for values in photograph_and_mask(renderer, index))
     settings = RasterSettings(model.sh_degree, model.background)

@@ -6,7 +6,19 @@ from pipelines.survey.options import CropOptions
 
 
 class CleanOptions(CropOptions):
-    """Options of the cleaned model."""
+    """Options of the cleaned model.
+
+    Gaussians go that are too transparent, float before the surface or far from everything, or lie outside a crop.
+    --gaussians keeps those that show most, merges the others into them, and fits them to the renders of the
+    trained model. The PSNR of the test views is stated before and after. The files of the splat (PLY, SPZ, tiles)
+    then take the cleaned model, as long as it was made from the trained one as it is; rasters, cloud and mesh keep
+    the trained one.
+
+    Examples:
+      georef clean flight
+      georef clean flight --gaussians 1500000
+      georef clean flight --crop --sh-degree 1 --gaussians 500000
+    """
 
     floaters: bool = Field(
         True,

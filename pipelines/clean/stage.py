@@ -27,9 +27,9 @@ from scipy.special import expit
 from pipelines.clean.evidence import Evidence, evidence_of
 from pipelines.clean.options import CleanOptions
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.products import Product, Remark, load_json, save_json
+from pipelines.core.products import Product, Remark, save_json
 from pipelines.core.progress import Progress
-from pipelines.core.stages import CLEANED, CLEANING, MODEL, REMOVED
+from pipelines.core.stages import CLEANED, CLEANING, REMOVED
 from pipelines.core.types import BoolArray, ByteArray
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.geometry.cameras import ViewPose, pose_matrix
@@ -38,17 +38,16 @@ from pipelines.splat.consolidation import consolidated, most_shown
 from pipelines.splat.gaussians import Gaussians, write_gaussians
 from pipelines.splat.initialise import scene_extent
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
-from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.sh import coefficient_count
 from pipelines.surface.crop import crop_of
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.floaters import MeasuredView, before_surface, isolated
 from pipelines.surface.photometry import mean_psnr
-from pipelines.surface.surface_views import ModelRenderer
+from pipelines.surface.surface_views import ModelRenderer, model_renderer
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.photographs import save_array
 from pipelines.survey.scene import load_adjusted_scene, photographs
-from pipelines.survey.trained_model import TrainedModel
-from pipelines.survey.trained_survey import TrainedSurvey, load_trained
+from pipelines.survey.solution import Solution, read_sfm, read_trained
 
 # Reasons for which a Gaussian went, by their number in `reason.npy`; 0: it stays.
 REASONS = ("kept", "transparent", "outside", "before_surface", "isolated", "consolidated")
@@ -94,35 +93,35 @@ def run(stage: StageRun, options: CleanOptions) -> Summary:
         DegenerateGeometryError: nothing is left.
         InputError: a photograph or a product cannot be read.
     """
-    progress, trained = stage.progress, load_trained(stage.workspace)
-    backend = rasterizer("auto", progress, mip_filter=trained.model.mip_filter)
-    images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
-    images.build(progress)
-    renderer = ModelRenderer(trained, images, backend)
-    views = trained.indices("train")
+    progress, model = stage.progress, read_trained(stage.workspace)
+    sfm, survey = read_sfm(stage.workspace, model), load_survey(stage.workspace)
+    renderer = model_renderer(stage.workspace, model, sfm, survey, progress=progress)
+    renderer.images.build(progress)
+    backend = renderer.backend
+    gaussians, views = renderer.gaussians, model.indices("train")
     needed = options.floaters or options.gaussians is not None
     evidence = evidence_of(renderer, backend, views, progress) if needed else None
-    reason = _reasons(stage.workspace, trained.gaussians, evidence, options, progress)
+    reason = _reasons(stage.workspace, gaussians, evidence, options, progress)
     if not (reason == KEPT).any():
         message = f"None of {len(reason)} Gaussians is left. Lower --min-opacity, or check --boundary."
         raise DegenerateGeometryError("nothing-left", message)
-    compared = _compared(trained)
+    compared = _compared(model)
     before = mean_psnr(renderer, compared, progress)
-    clean = _showing(renderer, trained.gaussians.select(torch.from_numpy(reason == KEPT)), backend)
+    clean = renderer.showing(gaussians.select(torch.from_numpy(reason == KEPT)))
     without = mean_psnr(clean, compared, progress)
-    fewer = clean.trained.gaussians
+    fewer = clean.gaussians
     if evidence is not None and options.gaussians is not None:
         rows, shown = np.flatnonzero(reason == KEPT), evidence.weight_px[reason == KEPT]
         reason[rows[~most_shown(shown, options.gaussians)]] = CONSOLIDATED
         fewer = consolidated(fewer, shown, options.gaussians)
     smaller = _smaller(clean, fewer, backend, options, progress)
-    made = smaller.trained.gaussians
+    made = smaller.gaussians
     after = without if smaller is clean else mean_psnr(smaller, compared, progress)
-    filtered = trained.model.mip_filter
+    filtered = model.mip_filter
     write_gaussians(stage.out / Path(CLEANED).name, made, mip_filter=filtered)
     floats = (reason == BEFORE_SURFACE) | (reason == ISOLATED)
     if floats.any():
-        removed = trained.gaussians.select(torch.from_numpy(floats))
+        removed = gaussians.select(torch.from_numpy(floats))
         write_gaussians(stage.out / Path(REMOVED).name, removed, mip_filter=filtered)
     save_array(stage.out / REASON_FILE, reason)
     counts = np.bincount(reason, minlength=len(REASONS)).tolist()
@@ -131,17 +130,17 @@ def run(stage: StageRun, options: CleanOptions) -> Summary:
         cleaned=len(made),
         removed=dict(zip(REASONS[1:], counts[1:], strict=True)),
         sh_degree=made.sh_degree,
-        compared="test views" if trained.indices("test") else "training views",
+        compared="test views" if model.indices("test") else "training views",
         views=len(compared),
         psnr_trained=before,
         psnr_without_floaters=without,
         psnr_cleaned=after,
     )
     save_json(record, stage.out / Path(CLEANING).name)
-    return _summary(record, trained)
+    return _summary(record, model.cautions)
 
 
-def _summary(record: Cleaning, trained: TrainedSurvey) -> Summary:
+def _summary(record: Cleaning, cautions: tuple[Remark, ...]) -> Summary:
     figure, warnings = f"{record.cleaned} of {record.trained} Gaussians", []
     before, without, after = record.psnr_trained, record.psnr_without_floaters, record.psnr_cleaned
     if before is not None and without is not None and after is not None:
@@ -149,10 +148,10 @@ def _summary(record: Cleaning, trained: TrainedSurvey) -> Summary:
         if without < before - _TOLERATED_DB:
             sentence = (
                 f"Without what was removed as transparent, outside or floating, the {record.compared} have "
-                f"{before - without:.2f} dB less PSNR: it was part of the scene, or a crop left it out. Look at "
-                f"{REMOVED}, and give a larger --floater-sigma or --no-floaters."
+                f"{before - without:.2f} dB less PSNR: it was part of the scene, or a crop left it out."
             )
-            warnings.append(Remark(code="clean-costs-detail", sentence=sentence))
+            remedy = f"Look at {REMOVED}, and give a larger --floater-sigma or --no-floaters."
+            warnings.append(Remark(code="clean-costs-detail", sentence=sentence, remedy=remedy))
     return Summary(
         figure,
         {
@@ -160,14 +159,14 @@ def _summary(record: Cleaning, trained: TrainedSurvey) -> Summary:
             **{f"removed_{reason}": count for reason, count in record.removed.items()},
         },
         warnings=tuple(warnings),
-        cautions=trained.model.cautions,
+        cautions=cautions,
     )
 
 
-def _compared(trained: TrainedSurvey) -> list[int]:
+def _compared(solution: Solution) -> list[int]:
     """Return the views whose PSNR is stated: the test views, or without any some training views."""
-    views = trained.indices("train")
-    return trained.indices("test") or views[:: -(-len(views) // _MOST_COMPARED)]
+    views = solution.indices("train")
+    return solution.indices("test") or views[:: -(-len(views) // _MOST_COMPARED)]
 
 
 def _reasons(
@@ -202,8 +201,8 @@ def _floating(before: BoolArray, alone: BoolArray, doubtful: BoolArray) -> BoolA
 
 def _measured(workspace: Workspace, progress: Progress) -> Iterator[MeasuredView]:
     """Yield the depth maps of the training photographs, which training has left in the cache or are made again."""
-    _, _, survey, scene = load_adjusted_scene(workspace)
-    model = load_json(TrainedModel, workspace.path(MODEL))
+    _, survey, scene = load_adjusted_scene(workspace)
+    model = read_trained(workspace)
     maps = DepthMaps(
         workspace.cache / "surface", scene, photographs(scene.sparse, survey, workspace, model.max_image_size)
     )
@@ -215,14 +214,6 @@ def _measured(workspace: Workspace, progress: Progress) -> Iterator[MeasuredView
         yield MeasuredView(pose, maps.depth(index))
 
 
-def _showing(renderer: ModelRenderer, gaussians: Gaussians, backend: Rasterizer) -> ModelRenderer:
-    """Return the renderer of other Gaussians in the place of a model's."""
-    model = renderer.trained.model
-    degree = min(model.sh_degree, gaussians.sh_degree)
-    trained = replace(renderer.trained, gaussians=gaussians, model=model.model_copy(update={"sh_degree": degree}))
-    return ModelRenderer(trained, renderer.images, backend)
-
-
 def _smaller(
     clean: ModelRenderer, left: Gaussians, backend: Rasterizer, options: CleanOptions, progress: Progress
 ) -> ModelRenderer:
@@ -230,25 +221,25 @@ def _smaller(
 
     Where anything is missing now, what is left is fitted to the renders of the renderer `clean`.
     """
-    degree = clean.trained.model.sh_degree if options.sh_degree is None else options.sh_degree
+    degree = clean.model.sh_degree if options.sh_degree is None else options.sh_degree
     count = coefficient_count(min(degree, left.sh_degree))
-    if len(left) == len(clean.trained.gaussians) and count == left.sh.shape[1]:
+    if len(left) == len(clean.gaussians) and count == left.sh.shape[1]:
         return clean
     cut = replace(left, sh=left.sh[:, :count].contiguous())
-    views = clean.trained.indices("train")
+    views = clean.model.indices("train")
     order = shuffled_passes(len(views), options.refit_passes, np.random.default_rng(0))
 
-    def shown(number: int) -> ShownView:
+    def training_view(number: int) -> ShownView:
         pose = clean.pose(views[number])
         matrix = torch.from_numpy(pose_matrix(pose.cam_from_model, pose.center_in_model)).float()
         return ShownView(matrix, pose.pinhole, clean.render(pose).colour.clamp(0, 1))
 
-    model = clean.trained.model
+    model = clean.model
     settings = RasterSettings(min(model.sh_degree, cut.sh_degree), model.background)
     if not order:
-        return _showing(clean, cut, backend)
-    extent_m = scene_extent(clean.trained.poses.cam_center_in_model)
+        return clean.showing(cut)
+    extent_m = scene_extent(clean.poses.cam_center_in_model)
     fitted = refine_appearance(
-        cut, shown, order, backend, settings, rates=WITH_SHAPES, extent_m=extent_m, progress=progress
+        cut, training_view, order, backend, settings, rates=WITH_SHAPES, extent_m=extent_m, progress=progress
     )
-    return _showing(clean, fitted, backend)
+    return clean.showing(fitted)

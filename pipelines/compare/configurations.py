@@ -17,14 +17,10 @@ from pipelines.core.staleness import Flags
 from pipelines.report.page import Page, Section, png_file, render_page
 from pipelines.report.plots.charts import write_bars
 
-_FIXED: Flags = {
-    "optimize_cameras": False,
-    "geo_loss": False,
-    "gcp_loss": False,
-    "distance_loss": False,
-    "geo_schedule": "constant",
-}
-_JOINT: Flags = {**_FIXED, "optimize_cameras": True, "geo_loss": True}
+# Losses of the geographic part, of which each configuration that trains similarity and cameras adds some.
+_ALONE: Flags = {"gcp_loss": False, "distance_loss": False, "geo_schedule": "constant"}
+_FIXED: Flags = {**_ALONE, "georeference": "frozen", "gcp_mode": "triangulated"}
+_BOTH: Flags = {**_ALONE, "gcp_loss": True, "distance_loss": True}
 
 
 @dataclass(frozen=True)
@@ -65,23 +61,22 @@ CONFIGURATIONS: tuple[Configuration, ...] = (
     Configuration(
         "C", "B + joint T and cameras, L_abs",
         "similarity and cameras trained with L_abs alone, from a robust start; no control points",
-        {"method": "robust", "control_points": False}, _JOINT,
+        {"method": "robust", "control_points": False}, _ALONE,
     ),
     Configuration(
         "D", "C + L_gcp + L_rel",
         "control points and relative distances too, at constant weight",
-        {"method": "robust", "control_points": True}, {**_JOINT, "gcp_loss": True, "distance_loss": True},
+        {"method": "robust", "control_points": True}, _BOTH,
     ),
     Configuration(
         "E", "D + adaptive weight, the full method",
         "the weight of the geographic losses rises while training",
-        {"method": "robust", "control_points": True},
-        {**_JOINT, "gcp_loss": True, "distance_loss": True, "geo_schedule": "rising"},
+        {"method": "robust", "control_points": True}, {**_BOTH, "geo_schedule": "rising"},
     ),
 )  # fmt: skip
 BY_CONFIGURATION = {configuration.name: configuration for configuration in CONFIGURATIONS}
 # Users cannot set the options that define the configurations. All other options of `train` hold for all of them.
-COMMON_TRAIN_OPTIONS = tuple(name for name in BY_NAME["train"].options.model_fields if name not in _FIXED)
+COMMON_TRAIN_OPTIONS = tuple(name for name in BY_NAME["train"].options.model_fields if name not in _ALONE)
 
 
 def select_configurations(text: str) -> tuple[Configuration, ...]:

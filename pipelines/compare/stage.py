@@ -11,8 +11,8 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration, write_comparison
-from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy, surface_accuracy
-from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError
+from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy, compared_surface
+from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError, InputError
 from pipelines.core.options import read_requests, remember
 from pipelines.core.products import union
 from pipelines.core.progress import SILENT, Progress
@@ -74,10 +74,15 @@ def compare(
         GeorefError: the first other failure.
     """
     must_exist(workspace)
+    if flags.get("georeference") == "frozen":
+        message = "'frozen' would make C, D and E one with A: choose joint or paper."
+        raise InputError("georeference-frozen", message, field="--georeference")
     with workspace.lock(FOLDER):
         requests = read_requests(workspace.root)
         asked = {**requests.get("train", {}), **requests.get(FOLDER, {}), **flags}
         asked = {name: value for name, value in asked.items() if name in COMMON_TRAIN_OPTIONS}
+        if asked.get("georeference") == "frozen":  # of a training: the configurations decide what moves
+            del asked["georeference"]
         plans = [(configuration, tuple(_plan(workspace, configuration, asked))) for configuration in configurations]
         for _, plan in plans:
             for planned in plan:
@@ -113,7 +118,7 @@ def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> I
     if configuration.sim3 is not None:
         yield VariantStage(variant, _INIT, {**configuration.sim3, "max_residual": None, **seed})
     if configuration.trained_by is None:
-        yield VariantStage(variant, _TRAIN, {**asked, **configuration.train})
+        yield VariantStage(variant, _TRAIN, {"georeference": "joint", **asked, **configuration.train})
     similarity = "trained" if configuration.trained_by is None else "initial"
     backend = {"backend": asked["backend"]} if "backend" in asked else {}
     evaluated = read_requests(workspace.root).get(_EVALUATE.name, {})
@@ -178,7 +183,7 @@ def _row(configuration: Configuration, plan: Sequence[VariantStage], runner: _Pl
         test_ssim=test.ssim,
         triangulated=PointAccuracy.model_validate(report.checkpoints.triangulated, from_attributes=True),
         surface=PointAccuracy.model_validate(report.checkpoints.surface, from_attributes=True),
-        reference=surface_accuracy(report.reference),
+        reference=compared_surface(report.reference),
         iterations=training.get("iterations"),
         gaussians=training.get("gaussians"),
         training_s=training.get("seconds") if configuration.trained_by is None else None,

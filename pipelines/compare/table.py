@@ -30,7 +30,7 @@ class PointAccuracy(Product):
     rmse_v_m: float | None = None
 
 
-class SurfaceAccuracy(Product):
+class ComparedSurface(Product):
     """Surface against the reference cloud of `evaluate`: M3C2 distances, and F1 by threshold in metres."""
 
     median_m: float | None
@@ -62,7 +62,7 @@ class ComparedRow(Product):
     test_ssim: float | None = None
     triangulated: PointAccuracy = PointAccuracy()
     surface: PointAccuracy = PointAccuracy()
-    reference: SurfaceAccuracy | None = None
+    reference: ComparedSurface | None = None
     iterations: int | None = None
     gaussians: int | None = None
     training_s: float | None = None
@@ -78,11 +78,12 @@ class Comparison(Product):
     rows: tuple[ComparedRow, ...]
 
 
-def surface_accuracy(reference: ReferenceComparison | None) -> SurfaceAccuracy | None:
+def compared_surface(reference: ReferenceComparison | None) -> ComparedSurface | None:
+    """Return distances and scores of the whole surface against a reference cloud; None without a comparison."""
     if reference is None:
         return None
     everywhere = next(group for group in reference.groups if group.name == "all")
-    return SurfaceAccuracy(
+    return ComparedSurface(
         median_m=everywhere.m3c2.median_m,
         nmad_m=everywhere.m3c2.nmad_m,
         f1=tuple((score.threshold_m, score.f1) for score in everywhere.scores),
@@ -90,6 +91,7 @@ def surface_accuracy(reference: ReferenceComparison | None) -> SurfaceAccuracy |
 
 
 def bar_charts(rows: Sequence[ComparedRow]) -> tuple[BarChart, ...]:
+    """Return the charts of a comparison, with a bar for each configuration: RMSE of check points, PSNR, time."""
     members = tuple(row.configuration for row in rows)
     geometry = (
         BarChart(
@@ -163,7 +165,7 @@ def reference_cells(row: ComparedRow) -> tuple[str, ...]:
 def remarks_on(row: ComparedRow) -> tuple[str, ...]:
     """Return the reason why a row is empty, and the warnings and cautions of its stages."""
     failure = () if row.failure is None else (f"failed: {row.failure}",)
-    return (*failure, *(remark.sentence for remark in (*row.warnings, *row.cautions)))
+    return (*failure, *(remark.text for remark in (*row.warnings, *row.cautions)))
 
 
 def _line(parts: Iterable[str]) -> str:

@@ -28,6 +28,10 @@ from pipelines.core.progress import SILENT, Progress, ProgressTask
 log = logging.getLogger(__name__)
 
 
+# A process whose parent was killed saves its work and ends within so long; the command given again waits for that.
+ORPHAN_S = 5.0
+
+
 class MessageSender:
     """Sender of messages to the receiver that reads a stream; also the `Progress` of its process, and its tasks."""
 
@@ -230,11 +234,10 @@ def _error(message: Mapping[str, Any]) -> Exception:
         return RuntimeError(f"in a child process:\n{message['text']}")
     kind = getattr(errors, message["type"], errors.GeorefError)
     if issubclass(kind, errors.InputError):
-        where = {name: message[name] for name in ("path", "line", "field", "hint")}
-        return kind(message["code"], message["message"], **where)
+        where = {name: message[name] for name in ("path", "line", "field")}
+        return kind(message["code"], message["message"], **where, remedy=message["remedy"] or "")
     kind = errors.GeorefError if kind is errors.MissingProductError else kind
-    error: errors.GeorefError = kind(message["code"], message["message"])
-    error.hint = message["hint"]
+    error: errors.GeorefError = kind(message["code"], message["message"], remedy=message["remedy"] or "")
     return error
 
 

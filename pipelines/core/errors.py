@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar
 
+from pipelines.core.sentences import with_remedy
+
 
 class GeorefError(Exception):
     """Failure that the user can understand and act on.
@@ -18,20 +20,23 @@ class GeorefError(Exception):
         kind: class of the failure, for machines.
         code: the failure itself, for machines and tests: lower-case words joined by hyphens, stable while the
             wording of the message changes.
-        hint: the remedy, where it is known apart from the message.
+        fault: what is wrong, with its place.
+        remedy: what to type against it, where that is known apart from the fault; as of a `Remark`.
+
+    As a text it is both.
     """
 
     kind: ClassVar[str] = "failed"
-    hint: str | None = None
 
-    def __init__(self, code: str, message: str) -> None:
-        super().__init__(message)
-        self.code = code
+    def __init__(self, code: str, message: str, *, remedy: str = "") -> None:
+        super().__init__(with_remedy(message, remedy))
+        self.code, self.fault, self.remedy = code, message, remedy
 
     def document(self) -> dict[str, str | int | None]:
-        """Return the JSON form: kind, code, message, path, line, field and hint."""
+        """Return the JSON form: kind, code, message, path, line, field and remedy."""
         nowhere = dict.fromkeys(("path", "line", "field"))
-        return {"kind": self.kind, "code": self.code, "message": str(self), **nowhere, "hint": self.hint}
+        remedy = self.remedy or None
+        return {"kind": self.kind, "code": self.code, "message": self.fault, **nowhere, "remedy": remedy}
 
 
 class InputError(GeorefError):
@@ -47,17 +52,16 @@ class InputError(GeorefError):
         path: Path | str | None = None,
         line: int | None = None,
         field: str | None = None,
-        hint: str | None = None,
+        remedy: str = "",
     ) -> None:
         self.message = message
         self.path = Path(path) if path is not None else None
         self.line = line
         self.field = field
-        self.hint = hint
         where = "" if path is None else str(path) + (f":{line}" if line is not None else "")
         if field is not None:
             where = f"{where} [{field}]" if where else f"[{field}]"
-        super().__init__(code, f"{where}: {message}" if where else message)
+        super().__init__(code, f"{where}: {message}" if where else message, remedy=remedy)
 
     @property
     def is_usage(self) -> bool:
@@ -84,8 +88,7 @@ class MissingProductError(GeorefError):
     def __init__(self, product: str, command: str) -> None:
         self.product = product
         self.command = command
-        self.hint = f"run `{command}` first"
-        super().__init__("missing-product", f"{product} is missing. Run `{command}` first.")
+        super().__init__("missing-product", f"{product} is missing.", remedy=f"Run `{command}` first.")
 
 
 class WorkspaceBusyError(GeorefError):
@@ -178,14 +181,14 @@ _STORAGE_REASONS = {
 }
 
 
-def storage_error(error: BaseException, place: Path | None = None) -> StorageError | None:
+def storage_error(error: BaseException, target: Path | None = None) -> StorageError | None:
     """Return the storage failure behind an exception, or None.
 
     Libraries replace an OSError by an error of their own while they close a half-written file. Failures
     of the disk count also if the exception arose in their handling.
 
     Args:
-        place: file or folder that was written, for failures that name none, mostly those of a full disk.
+        target: file or folder that was written, for failures that name none, mostly those of a full disk.
     """
     seen: set[int] = set()
     cause: BaseException | None = error
@@ -198,7 +201,7 @@ def storage_error(error: BaseException, place: Path | None = None) -> StorageErr
             code = errno.ENOSPC
         if code in _STORAGE_REASONS and (cause is error or code in _DISK_FAILURES):
             path = getattr(cause, "filename", None)
-            return StorageError(*_storage_message(code, path or place or "workspace or output"))
+            return StorageError(*_storage_message(code, path or target or "workspace or output"))
         cause = cause.__cause__ or cause.__context__
     return None
 
@@ -215,14 +218,14 @@ def _storage_message(code: int, path: Path | str) -> tuple[str, str]:
 
 
 @contextmanager
-def storage_failures(place: Path | None = None) -> Iterator[None]:
+def storage_failures(target: Path | None = None) -> Iterator[None]:
     """Turn storage failures of any library into `StorageError` while the context lasts; `place` as above."""
     try:
         yield
     except GeorefError:
         raise
     except Exception as error:
-        storage = storage_error(error, place)
+        storage = storage_error(error, target)
         if storage is None:
             raise
         raise storage from error

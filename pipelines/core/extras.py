@@ -99,6 +99,7 @@ def require(extra: Extra) -> None:
 
 
 def extra_part(extra: Extra) -> Part:
+    """Return an extra with its libraries' versions, or with what is missing and the command that installs it."""
     user, libraries = EXTRAS[extra]
     missing = [name for name in libraries if find_spec(module_of(name)) is None]
     if missing:

@@ -73,6 +73,14 @@ ERRORS = {
     "max_v_m": Figure("max V", "largest vertical error"),
     "max_3d_m": Figure("max 3D", "largest error in three dimensions"),
 }
+# Errors of the surface at measured points that the training was not given, by field of
+# `survey.report_parts.DepthErrors`.
+DEPTH_ERRORS = {
+    "points": Figure("points", "held-out measured points at which both surfaces are known", "", 0),
+    "bias_m": Figure("bias", "median error along the points' normals; above zero: in front of the points"),
+    "median_m": Figure("median", "median magnitude of the error"),
+    "abs_90_m": Figure("90 %", "magnitude that nine of ten errors do not exceed"),
+}
 # Predicted σ over the cells of the scene, by the prefix of the fields of `survey.report.AccuracySummary`.
 CELLS = {
     "least": Figure("least", "σ of the best cell of the scene"),
@@ -162,6 +170,9 @@ class Headline(Product):
             predicted σ over the scene. None: not known, such as V where heights count from an unknown take-off.
         check_points: number of check points; 0 unless measured.
         reason: reason why it is not known; None: it is.
+        vegetated: number of further check points, which lie under vegetation and do not count.
+        beyond_class: of the check points, number of those whose error exceeds three times the class that the others
+            meet, although they are not refuted; they count in RMSE and number.
         blunders: names of the check points that the others and σ refute; they count in RMSE and number.
         rmse_h_without_m, rmse_v_without_m: RMSE without the blunders. None: there are none, or no other point.
         surface: accuracy of the surface; None: no check point measures it.
@@ -172,6 +183,8 @@ class Headline(Product):
     rmse_v_m: float | None = None
     check_points: int = 0
     reason: str | None = None
+    vegetated: int = 0
+    beyond_class: int = 0
     blunders: tuple[str, ...] = ()
     rmse_h_without_m: float | None = None
     rmse_v_without_m: float | None = None
@@ -179,19 +192,25 @@ class Headline(Product):
 
     @property
     def text(self) -> str:
-        """Both figures: `measured at 9 check points, triangulated: RMSE H 4.2 cm, V 5.1 cm; of the surface: …`."""
+        """Both figures: `predicted, not measured: σ H 4.2 cm, V 5.1 cm; of the surface: RMSE V 6.3 cm …`."""
         return self.of_points + (f"; of the surface: {self.surface.text}" if self.surface is not None else "")
 
     @property
     def of_points(self) -> str:
-        """Kind and figures of the points: `measured at 9 check points, triangulated: RMSE H 4.2 cm, V 5 cm`."""
+        """Kind and figures of the points, with which points they are, and by which measurement.
+
+        Such as `measured at 9 check points, triangulated, with the error of their survey: RMSE H 4.2 cm, V 5.1 cm`.
+        """
         if self.kind == "unknown":
             return f"not known: {self.reason}"
         vertical = "unknown" if self.rmse_v_m is None else ACCURACY_V.with_unit(self.rmse_v_m)
         figures = f"H {ACCURACY_H.with_unit(self.rmse_h_m)}, V {vertical}"
         if self.kind == "predicted":
             return f"predicted, not measured: σ {figures}"
-        text = f"measured at {_checks(self.check_points)}, triangulated: RMSE {figures}"
+        where = f"{_checks(self.check_points)}{' outside vegetation' if self.vegetated else ''}"
+        text = f"measured at {where}, triangulated, with the error of their survey: RMSE {figures}"
+        if self.beyond_class:
+            text += f"; {self.beyond_class} of them exceed three times the class of the others, and count"
         if self.rmse_h_without_m is None:
             return text
         others = f"H {ACCURACY_H.with_unit(self.rmse_h_without_m)}, V {ACCURACY_V.with_unit(self.rmse_v_without_m)}"

@@ -94,6 +94,11 @@ def replace_folder(draft: Path, folder: Path, aside: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
+    """Write a file's data to the disk.
+
+    Raises:
+        OSError: the file cannot be opened or written.
+    """
     with path.open("r+b" if os.access(path, os.W_OK) else "rb") as handle:
         os.fsync(handle.fileno())
 
@@ -165,7 +170,9 @@ def file_size(path: Path, *, limit_bytes: int | None = None, kind: str = "file",
         raise InputError("file-unreadable", f"cannot be read: {reason}.", path=path, field=field) from error
     if not stat.S_ISREG(status.st_mode):
         other = _SPECIAL.get(stat.S_IFMT(status.st_mode), "not a regular file")
-        raise InputError("not-a-file", f"cannot be read: it is {other}. Give a file.", path=path, field=field)
+        raise InputError(
+            "not-a-file", f"cannot be read: it is {other}.", path=path, field=field, remedy="Give a file."
+        )
     if limit_bytes is not None and status.st_size > limit_bytes:
         size, limit = status.st_size / 2**20, limit_bytes / 2**20
         message = f"is too large for a {kind}: {size:.0f} MiB (limit {limit:.0f} MiB)."

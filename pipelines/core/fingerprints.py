@@ -192,8 +192,10 @@ def _record(path: Path) -> FileRecord:
 def _beside(path: Path, marker: InputMarker) -> dict[str, Path]:
     """Return the files that count with a file, by their paths from its folder."""
     patterns = dict(marker.beside).get(path.suffix.lower(), ())
-    found = {file for pattern in patterns for file in path.parent.glob(pattern) if file.is_file() and file != path}
-    return {Path(os.path.relpath(file, path.parent)).as_posix(): file for file in found}
+    companions = {
+        file for pattern in patterns for file in path.parent.glob(pattern) if file.is_file() and file != path
+    }
+    return {Path(os.path.relpath(file, path.parent)).as_posix(): file for file in companions}
 
 
 def _input_files(folder: Path, workspace_root: Path, marker: InputMarker) -> dict[str, Path]:
@@ -201,12 +203,12 @@ def _input_files(folder: Path, workspace_root: Path, marker: InputMarker) -> dic
     if marker.only:
         return {name: folder / name for name in sorted(marker.only) if (folder / name).is_file()}
     # Resolved, because `workspace/../photos` is not in the workspace.
-    place, workspace = folder.resolve(), workspace_root.resolve()
+    real_folder, workspace = folder.resolve(), workspace_root.resolve()
     return {
         name: file
         for name, file in _files(folder).items()
         if not any(part.startswith(".") for part in file.relative_to(folder).parts)
-        and not (place / file.relative_to(folder)).is_relative_to(workspace)
+        and not (real_folder / file.relative_to(folder)).is_relative_to(workspace)
         and (not marker.suffixes or file.suffix.lower() in marker.suffixes)
     }
 

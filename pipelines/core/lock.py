@@ -75,8 +75,9 @@ class WriteLock:
                 return handle
             handle.close()
             if not locked:
-                message = f"{self.folder} is being written by {self._holder()}. Wait for it, or stop it."
-                raise WorkspaceBusyError("workspace-busy", message)
+                message = f"{self.folder} is being written by {self._holder()}."
+                remedy = "Wait for it, or stop it."
+                raise WorkspaceBusyError("workspace-busy", message, remedy=remedy)
 
     def _is_current(self, handle: BinaryIO) -> bool:
         """Return whether the open file still has its name: another process may have discarded it."""
@@ -92,8 +93,8 @@ class WriteLock:
             # A network file system locks only a file that is open for writing.
             with path.open("r+b" if os.access(path, os.W_OK) else "rb") as handle:
                 # A running stage asks as well, and must not wait for its own lock.
-                own = self._holder().endswith(f"{_IN_PROCESS}{os.getpid()}")
-                if not _lock(handle, 0.0 if own else _PATIENCE_S):
+                is_own = self._holder().endswith(f"{_IN_PROCESS}{os.getpid()}")
+                if not _lock(handle, 0.0 if is_own else _PATIENCE_S):
                     return self._holder().partition(_IN_PROCESS)[0]
                 unlock_descriptor(handle.fileno())
         except OSError:

@@ -74,9 +74,14 @@ class EffortMarker:
     """Mark of an option that changes the time or the messages of a stage, and not its result."""
 
 
+class HiddenMarker:
+    """Mark of an option that no user needs: it is valid everywhere, and help and documentation leave it out."""
+
+
 InputPath = Annotated[Path, InputMarker()]
 WRITTEN = WrittenMarker()
 EFFORT = EffortMarker()
+HIDDEN = HiddenMarker()
 
 
 class StageOptions(BaseModel):
@@ -120,13 +125,13 @@ def _finite(numbers: Vector3) -> Vector3:
     return numbers
 
 
-def _on_earth(place: Vector3) -> Vector3:
-    lat, lon, alt = place
+def _on_earth(position: Vector3) -> Vector3:
+    lat, lon, alt = position
     if abs(lat) > 90 or abs(lon) > 180 or not -1000 <= alt <= 10000:
         raise ValueError(
             "the range is −90 … 90° of latitude, −180 … 180° of longitude and −1000 … 10000 m of height"
         )
-    return place
+    return position
 
 
 Triple = Annotated[Vector3, from_text(triple_of), AfterValidator(_finite), WRITTEN]
@@ -229,12 +234,15 @@ def resolve(
         key = str(first["loc"][0]) if first["loc"] else "?"
         from_file = key in table and key not in flags
         known = ", ".join(sorted(options_type.model_fields))
-        code, message = "option-invalid", fault_sentence(first)
+        code, message, remedy = "option-invalid", fault_sentence(first), ""
         if first["type"] == "extra_forbidden":
             code, message = "unknown-option", f"is unknown. The options are {known}."
+            remembered_in = toml.parent / REQUESTS
+            if not from_file and remembered_in.exists():  # what the command line offers is known
+                remedy = f"An earlier version of GeoRefGS has remembered it: delete it from {remembered_in}."
         in_file = key if stage is None else f"{stage}.{key}"
         name = in_file if from_file else flag_name(options_type, key)
-        raise InputError(code, message, path=toml if from_file else None, field=name) from error
+        raise InputError(code, message, path=toml if from_file else None, field=name, remedy=remedy) from error
     for name in options_type.model_fields:
         value = getattr(options, name)
         if isinstance(value, Path):
@@ -315,13 +323,13 @@ def remembered(
     forget: Mapping[str, Collection[str]] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Return by stage the options last requested, but those to forget, overridden by flags."""
-    asked = {}
+    requested = {}
     before = read_requests(root)
     for stage in stages:
         forgotten = (forget or {}).get(stage, ())
         kept = {name: value for name, value in before.get(stage, {}).items() if name not in forgotten}
-        asked[stage] = {**kept, **flags.get(stage, {})}
-    return asked
+        requested[stage] = {**kept, **flags.get(stage, {})}
+    return requested
 
 
 def read_requests(root: Path) -> dict[str, dict[str, Any]]:
@@ -338,25 +346,28 @@ def read_requests(root: Path) -> dict[str, dict[str, Any]]:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise InputError(
-            "requests-damaged", "is not valid JSON. Delete it, and give the options again.", path=path
+            "requests-damaged", "is not valid JSON.", path=path, remedy="Delete it, and give the options again."
         ) from error
     if not isinstance(document, dict) or not all(isinstance(flags, dict) for flags in document.values()):
         raise InputError(
-            "requests-damaged", "has no options by stage. Delete it, and give the options again.", path=path
+            "requests-damaged",
+            "has no options by stage.",
+            path=path,
+            remedy="Delete it, and give the options again.",
         )
-    place = document.pop(_PLACE, {}).get("root")
-    if not isinstance(place, str) or place == str(root):
+    former_root = document.pop(_PLACE, {}).get("root")
+    if not isinstance(former_root, str) or former_root == str(root):
         return document
     return {
-        stage: {name: _moved(value, Path(place), root) for name, value in flags.items()}
+        stage: {name: _moved(value, Path(former_root), root) for name, value in flags.items()}
         for stage, flags in document.items()
     }
 
 
 def remember(root: Path, flags: Mapping[str, Mapping[str, Any]]) -> None:
     """Record the options that some stages are requested with, by stage."""
-    asked = {**read_requests(root), **flags}
-    document = {**{stage: dict(given) for stage, given in asked.items()}, _PLACE: {"root": str(root)}}
+    requested = {**read_requests(root), **flags}
+    document = {**{stage: dict(given) for stage, given in requested.items()}, _PLACE: {"root": str(root)}}
     replace_text(root / REQUESTS, json.dumps(document, indent=1, default=str) + "\n")
 
 

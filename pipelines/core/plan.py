@@ -34,14 +34,14 @@ def option_origins(workspace: Workspace, spec: StageSpec, flags: Flags | None = 
     The flags are the present request; None: what is remembered.
     """
     remembered = read_requests(workspace.root).get(spec.name, {})
-    asked = remembered if flags is None else flags
-    options = staleness.stage_config(workspace, spec, asked)
+    given = remembered if flags is None else flags
+    options = staleness.stage_config(workspace, spec, given)
     table = load_toml(workspace.config_file, BY_NAME).get(spec.name, {})
     plain = options.model_dump(mode="json")  # as options are remembered
     rows = []
     for name in type(options).model_fields:
         origin: Origin = "georef.toml"
-        if name in asked:
+        if name in given:
             is_old = flags is None or (name in remembered and remembered[name] == plain[name])
             origin = "remembered" if is_old else "command line"
         elif name not in table:
@@ -83,12 +83,12 @@ def plan(
     running: set[str] = set()
     planned = []
     for spec in stages:
-        asked = flags.get(spec.name, {})
-        resolved = staleness.stage_config(workspace, spec, asked)
-        action, reason = _action(workspace, spec, asked, resolved, running, memo=memo, force=force)
+        stage_flags = flags.get(spec.name, {})
+        resolved = staleness.stage_config(workspace, spec, stage_flags)
+        action, reason = _action(workspace, spec, stage_flags, resolved, running, memo=memo, force=force)
         if action != "keep":
             running.add(spec.name)
-        origins = tuple(option_origins(workspace, spec, asked))
+        origins = tuple(option_origins(workspace, spec, stage_flags))
         planned.append(PlannedStage(spec.name, action, reason, origins, resolved))
     return planned
 
@@ -96,7 +96,7 @@ def plan(
 def _action(
     workspace: Workspace,
     spec: StageSpec,
-    asked: Flags,
+    flags: Flags,
     options: StageOptions,
     running: Collection[str],
     *,
@@ -112,24 +112,24 @@ def _action(
         staleness.refuse_loss_by_options(workspace, spec, options)
     except InputError as error:
         return "refuse", str(error)
-    found = staleness.finding(workspace, spec, memo)
-    if found.by_hand:
+    product = staleness.finding(workspace, spec, memo)
+    if product.by_hand:
         return "keep", BY_HAND
-    if found.unreadable:
-        return "run", found.unreadable
-    manifest = found.manifest
+    if product.unreadable:
+        return "run", product.unreadable
+    manifest = product.manifest
     if manifest is None:
         for name, path in input_paths(options).items():  # no hashes: those of new photographs take minutes
             if not path.exists():
                 raise InputError("no-such-file", "does not exist.", path=path, field=flag_name(type(options), name))
         resumes = spec.resumable and workspace.partial(spec).exists()
         return ("resume", f"interrupted: {interrupted}") if resumes else ("run", "never run")
-    if found.damaged:
-        return "run", staleness.why_damaged(found.damaged)
+    if product.damaged:
+        return "run", staleness.why_damaged(product.damaged)
     changed = staleness.changed_options(options, manifest.config)
     if ahead := [producer.name for producer in staleness.producers(spec) if producer.name in running]:
         return ("run", changed) if changed else ("perhaps", f"after {', '.join(ahead)}")
-    present = staleness.request(workspace, spec, asked, memo)
+    present = staleness.request(workspace, spec, flags, memo)
     reason = staleness.why_stale(workspace, present, manifest)
     if staleness.is_unfinished(workspace, present):
         return "resume", f"interrupted beside the finished product: {interrupted}"

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, V
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, read_npz
-from pipelines.core.sentences import fault_sentence
+from pipelines.core.sentences import fault_sentence, with_remedy
 from pipelines.core.types import Matrix3, Quaternion
 from pipelines.core.validators import covariance, image_name, unit_quaternion
 
@@ -66,6 +66,7 @@ def dump_json(document: Any) -> str:
 
 
 def save_npz(path: Path, arrays: dict[str, Any]) -> None:
+    """Write arrays by name into a file without compression; missing folders are made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, **{name: np.asarray(array) for name, array in arrays.items()})  # type: ignore[arg-type]
 
@@ -105,10 +106,20 @@ NOT_CHECKED = "not-checked"
 
 
 class Remark(Product):
-    """Warning of a command, or caution of a product: a full sentence for people, a code for machines and tests."""
+    """Warning of a command, or caution of a product: a full sentence for people, a code for machines and tests.
+
+    `remedy`: what to type against it, in sentences for whoever runs the program; empty: nothing. Pages for clients
+    leave it out.
+    """
 
     code: Annotated[str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")]
     sentence: Annotated[str, StringConstraints(min_length=1)]
+    remedy: str = ""
+
+    @property
+    def text(self) -> str:
+        """Sentence and remedy, for whoever runs the program."""
+        return with_remedy(self.sentence, self.remedy)
 
 
 def union(*groups: tuple[Remark, ...]) -> tuple[Remark, ...]:

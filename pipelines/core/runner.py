@@ -90,7 +90,7 @@ def run_stage(
     renew: bool = False,
     resume: Resume = "never",
     progress: Progress = SILENT,
-    place: str = "",
+    position: str = "",
 ) -> Outcome:
     """Run one stage, unless its product is current or was put there by hand.
 
@@ -101,7 +101,7 @@ def run_stage(
         force: run even if the product is current, and start afresh.
         renew: run even if the product is current, with all that its parts have left.
         resume: whether to continue an interrupted run (see `Workspace.begin`), or to extend a finished product.
-        place: place of the stage in a longer run, for the log: `stage 2 of 8`.
+        position: position of the stage in a longer run, for the log: `stage 2 of 8`.
 
     Raises:
         BackendUnavailableError: an option needs an extra that is not installed.
@@ -112,22 +112,22 @@ def run_stage(
         staleness.must_exist(workspace)
     with clean_up_after_refusal(workspace), workspace.lock(spec.name):
         memo: Memo = {}
-        asked = staleness.request(workspace, spec, flags, memo, progress)
+        requested = staleness.request(workspace, spec, flags, memo, progress)
         staleness.warn_of_stale_inputs(workspace, spec, memo)
         staleness.refuse_damaged_inputs(workspace, spec, memo)
-        previous = None if force or renew else _current(workspace, asked, memo)
-        if previous is not None and resume != "never" and _goes_on(workspace, asked):
+        previous = None if force or renew else _current(workspace, requested, memo)
+        if previous is not None and resume != "never" and _goes_on(workspace, requested):
             previous = None
         if previous is None:
-            require_available(asked.options)
+            require_available(requested.options)
             if not force:
-                staleness.refuse_loss(workspace, spec, asked.options, asked.inputs.hashes)
+                staleness.refuse_loss(workspace, spec, requested.options, requested.inputs.hashes)
         before = read_requests(workspace.written).get(spec.name, {})
         remember(workspace.written, {spec.name: flags})
         if previous is not None:
-            return Outcome(spec.name, False, _with_present_files(workspace, asked, previous))
+            return Outcome(spec.name, False, _with_present_files(workspace, requested, previous))
         try:
-            manifest = _execute(workspace, asked, "never" if force else resume, progress, place)
+            manifest = _execute(workspace, requested, "never" if force else resume, progress, position)
         except errors.InputError:
             remember(workspace.written, {spec.name: before})
             raise
@@ -159,9 +159,9 @@ def run_pipeline(
     if stages[0].reads:
         staleness.must_exist(workspace)
     before = read_requests(workspace.root)
-    asked = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
+    flags_by_stage = remembered(workspace.root, [spec.name for spec in stages], flags, forget)
     for spec in stages:
-        options = staleness.stage_config(workspace, spec, asked[spec.name])
+        options = staleness.stage_config(workspace, spec, flags_by_stage[spec.name])
         if force or not (workspace.root / spec.product).exists():  # else it may be current, and need no extra
             require_available(options)
         if not force:
@@ -169,18 +169,18 @@ def run_pipeline(
     outcomes: list[Outcome] = []
     with clean_up_after_refusal(workspace):
         with workspace.lock("run"):
-            remember(workspace.root, asked)
+            remember(workspace.root, flags_by_stage)
         try:
             for number, spec in enumerate(stages, start=1):
                 with around(spec):
                     outcome = run_stage(
                         workspace,
                         spec,
-                        asked[spec.name],
+                        flags_by_stage[spec.name],
                         force=force,
                         resume="if-same",
                         progress=progress,
-                        place=f"stage {number} of {len(stages)}",
+                        position=f"stage {number} of {len(stages)}",
                     )
                 outcomes.append(outcome)
         except (errors.InputError, errors.MissingProductError):
@@ -192,59 +192,61 @@ def run_pipeline(
     return outcomes
 
 
-def _goes_on(workspace: Workspace, asked: Request) -> bool:
+def _goes_on(workspace: Workspace, requested: Request) -> bool:
     """Return whether to go on with an interrupted run beside a current product, and tell what lies there.
 
     Such runs are those of `--force`, or of other options that were tried in between. What cannot be continued is
     deleted; what another request can continue stays.
     """
-    spec, partial = asked.spec, workspace.partial_product(asked.spec)
+    spec, partial = requested.spec, workspace.partial_product(requested.spec)
     if not partial.folder.exists() or workspace.placed_by_hand(spec):
         return False
-    found = staleness.found_interrupted(workspace, spec)
-    if staleness.is_unfinished(workspace, asked):
-        log.info("%s: an interrupted run lies beside the finished product: %s", spec.name, found)
+    interrupted = staleness.found_interrupted(workspace, spec)
+    if staleness.is_unfinished(workspace, requested):
+        log.info("%s: an interrupted run lies beside the finished product: %s", spec.name, interrupted)
         return True
     if spec.resumable and partial.progress() is not None:
         command = staleness.continuing_command(workspace, spec)
         log.warning(
             "%s: an interrupted run lies beside this product (%s). `%s` continues it; --force drops it.",
-            spec.name, found, command, extra={"code": "interrupted-run-kept"},
+            spec.name, interrupted, command, extra={"code": "interrupted-run-kept"},
         )  # fmt: skip
         return False
-    log.info("%s: a run that did not end left nothing to go on with, and is dropped: %s", spec.name, found)
+    log.info("%s: a run that did not end left nothing to go on with, and is dropped: %s", spec.name, interrupted)
     remove(partial.folder)
     return False
 
 
-def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Progress, place: str) -> Manifest:
-    spec, resolved = asked.spec, asked.options.model_dump(mode="json")
+def _execute(
+    workspace: Workspace, requested: Request, resume: Resume, progress: Progress, position: str
+) -> Manifest:
+    spec, resolved = requested.spec, requested.options.model_dump(mode="json")
     partial = workspace.partial_product(spec)
     if spec.resumable and partial.folder.exists():
-        found = staleness.found_interrupted(workspace, spec)
-        if resume != "never" and partial.is_of(asked.token):
-            log.info("%s: goes on with an interrupted run: %s", spec.name, found)
+        interrupted = staleness.found_interrupted(workspace, spec)
+        if resume != "never" and partial.is_of(requested.token):
+            log.info("%s: goes on with an interrupted run: %s", spec.name, interrupted)
         else:
             log.warning(
                 "%s: the stage starts afresh, and its interrupted run is dropped (%s).",
-                spec.name, found, extra={"code": "interrupted-run-dropped"},
+                spec.name, interrupted, extra={"code": "interrupted-run-dropped"},
             )  # fmt: skip
     started, clock = datetime.now(UTC).replace(microsecond=0), time.monotonic()
-    summary = _run(workspace, asked, resume, progress, place)
+    summary = _run(workspace, requested, resume, progress, position)
     for product in products_of(spec):
         if not (partial.folder / product.removeprefix(f"{spec.folder}/")).exists():
             raise RuntimeError(f"{spec.module} did not write {product}")
     for warning in summary.warnings:
-        log.warning("%s: %s", spec.name, warning.sentence, extra={"code": warning.code})
+        log.warning("%s: %s", spec.name, warning.text, extra={"code": warning.code})
     carried = set(union(*staleness.cautions_by_stage(workspace, before=spec).values()))
     for caution in summary.cautions:
         if caution not in carried:
-            log.warning("%s: %s", spec.name, caution.sentence, extra={AT_END: True})
+            log.warning("%s: %s", spec.name, caution.text, extra={AT_END: True})
     manifest = Manifest(
         stage=spec.name,
         product_version=spec.product_version,
         config=resolved,
-        inputs=asked.inputs.hashes,
+        inputs=requested.inputs.hashes,
         versions=library_versions(),
         started=started,
         duration_s=round(time.monotonic() - clock, 3),
@@ -253,7 +255,7 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
         warnings=summary.warnings,
         cautions=summary.cautions,
         files=record_files(partial.folder, spec.working),
-        input_files=asked.inputs.files,
+        input_files=requested.inputs.files,
     )
     workspace.set_aside(staleness.finding(workspace, spec, {}).damaged)
     workspace.commit(spec, manifest)
@@ -261,32 +263,36 @@ def _execute(workspace: Workspace, asked: Request, resume: Resume, progress: Pro
     return manifest
 
 
-def _with_present_files(workspace: Workspace, asked: Request, manifest: Manifest) -> Manifest:
+def _with_present_files(workspace: Workspace, requested: Request, manifest: Manifest) -> Manifest:
     """Return the manifest of a current product with its input files as they are now, saved if they were moved.
 
     Their content is the same, but their times may differ: without new records each look would read them again.
     """
-    if workspace.outside or asked.inputs.files == manifest.input_files or not workspace.manifest(asked.spec):
+    if (
+        workspace.outside
+        or requested.inputs.files == manifest.input_files
+        or not workspace.manifest(requested.spec)
+    ):
         return manifest
-    renewed = manifest.model_copy(update={"input_files": asked.inputs.files})
-    replace_text(workspace.root / asked.spec.folder / MANIFEST, f"{renewed.model_dump_json(indent=1)}\n")
+    renewed = manifest.model_copy(update={"input_files": requested.inputs.files})
+    replace_text(workspace.root / requested.spec.folder / MANIFEST, f"{renewed.model_dump_json(indent=1)}\n")
     return renewed
 
 
-def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progress, place: str) -> Summary:
+def _run(workspace: Workspace, requested: Request, resume: Resume, progress: Progress, position: str) -> Summary:
     """Run the module of a stage; afresh, if the partial product to be continued is damaged."""
-    spec, token, afresh = asked.spec, asked.token, resume == "never"
+    spec, token, afresh = requested.spec, requested.token, resume == "never"
     out, resumed = workspace.begin(spec, token, resume)
-    extends = None if afresh else staleness.extendable_product(workspace, asked)
-    log.info("%s: %s%s", spec.name, "resumed" if resumed else "started", f", {place}" if place else "")
+    extends = None if afresh else staleness.extendable_product(workspace, requested)
+    log.info("%s: %s%s", spec.name, "resumed" if resumed else "started", f", {position}" if position else "")
     try:
         with errors.storage_failures(out):
             module = importlib.import_module(spec.module)
-            if spec.in_parts and module.made_in_parts(workspace, asked.options):
+            if spec.in_parts and module.made_in_parts(workspace, requested.options):
                 module = importlib.import_module(spec.in_parts)
             try:
                 summary: Summary = module.run(
-                    StageRun(workspace, out, progress, resumed, extends, afresh), asked.options
+                    StageRun(workspace, out, progress, resumed, extends, afresh), requested.options
                 )
             except errors.DamagedPartialError as error:
                 log.warning(
@@ -294,7 +300,7 @@ def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progres
                     spec.name, error, extra={"code": "interrupted-run-damaged"},
                 )  # fmt: skip
                 out, _ = workspace.begin(spec, token, "never")
-                summary = module.run(StageRun(workspace, out, progress, afresh=afresh), asked.options)
+                summary = module.run(StageRun(workspace, out, progress, afresh=afresh), requested.options)
     except errors.GeorefError as error:
         workspace.partial_product(spec).fail(str(error), worthless=isinstance(error, _RESULTS))
         raise
@@ -311,16 +317,16 @@ def _run(workspace: Workspace, asked: Request, resume: Resume, progress: Progres
     return summary
 
 
-def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | None:
+def _current(workspace: Workspace, requested: Request, memo: Memo) -> Manifest | None:
     """Return the manifest of a product that need not be made again, or None."""
-    spec = asked.spec
-    found = staleness.finding(workspace, spec, memo, by_content=True)
-    if found.by_hand:
+    spec = requested.spec
+    product = staleness.finding(workspace, spec, memo, by_content=True)
+    if product.by_hand:
         log.info("%s: %s was %s and is kept; --force replaces it", spec.name, spec.product, BY_HAND)
         return Manifest(
             stage=spec.name,
             config={},
-            inputs=asked.inputs.hashes,
+            inputs=requested.inputs.hashes,
             versions={},
             started=datetime.now(UTC).replace(microsecond=0),
             duration_s=0.0,
@@ -328,12 +334,12 @@ def _current(workspace: Workspace, asked: Request, memo: Memo) -> Manifest | Non
             values={},
             warnings=[],
         )
-    if found.unreadable or found.damaged:
-        cause = found.unreadable or f"{staleness.why_damaged(found.damaged)}."
-        code = "manifest-damaged" if found.unreadable else "product-damaged"
+    if product.unreadable or product.damaged:
+        cause = product.unreadable or f"{staleness.why_damaged(product.damaged)}."
+        code = "manifest-damaged" if product.unreadable else "product-damaged"
         log.warning("%s: the product is made again, because %s", spec.name, cause, extra={"code": code})
-    elif (manifest := found.manifest) is not None:
-        reason = staleness.why_stale(workspace, asked, manifest)
+    elif (manifest := product.manifest) is not None:
+        reason = staleness.why_stale(workspace, requested, manifest)
         log.info("%s: %s", spec.name, f"made again: {reason}" if reason else f"current: {manifest.key_figure}")
         return None if reason else manifest
     return None

@@ -42,27 +42,17 @@ def about(seconds: float | None) -> str:
     return text.removesuffix(" 00 s")
 
 
-# What is typed in a terminal: commands of this program, its options, its file of options.
-_TYPED = re.compile(r"`?\bgeoref [a-z]|georef\.toml|(?<![\w-])--[a-z]")
-_SENTENCES, _CLAUSES = re.compile(r"(?<=[.!?])\s+(?=[^\W\d_a-z]|`)"), re.compile(r"(?<=[:;])\s+")
 _FOLDERS = re.compile(r"(?<![\w:/.\\])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,\"'`]+[/\\])+")
 
 
-def without_commands(text: str) -> str:
-    """Return a text for a client: without the clauses that say what to type, and without folders of paths.
+def without_folders(text: str) -> str:
+    """Return a text for a client: of the paths in it, names without the folders of this machine."""
+    return _FOLDERS.sub("", text)
 
-    Clauses end with a full stop, a colon or a semicolon. A text of commands alone becomes empty.
-    """
-    told = []
-    for sentence in _SENTENCES.split(_FOLDERS.sub("", text)):
-        clauses = _CLAUSES.split(sentence)
-        kept = [clause for clause in clauses if not _TYPED.search(clause)]
-        if len(kept) < len(clauses) and kept:
-            end = "." if sentence.endswith(".") else ""
-            shown = " ".join(kept).rstrip(":;.") + end
-            kept = [shown[:1].upper() + shown[1:]]
-        told += [" ".join(kept)] if kept else []
-    return " ".join(told)
+
+def with_remedy(sentence: str, remedy: str) -> str:
+    """Return a message for whoever runs the program: what is so, and what to type against it, if anything."""
+    return f"{sentence} {remedy}" if remedy else sentence
 
 
 # Control characters (ESC, and OSC and CSI of C1), marks that turn the direction of writing, lone surrogates
@@ -81,6 +71,7 @@ def printable(text: str) -> str:
 
 
 def printable_lines(text: str) -> str:
+    """Return a text as `printable` does, but with its line breaks."""
     return "\n".join(printable(line) for line in text.split("\n"))
 
 

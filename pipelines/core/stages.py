@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pipelines.core.errors import GeorefError
 
@@ -23,7 +23,7 @@ SPARSE = "sfm/sparse"
 COMMON_POINTS = "sfm/sparse/common_points.npz"  # only of a survey that is tied to an earlier one
 RIG = "calibrate/rig.json"
 POINTS = "geolocate/points.npz"
-SIM3 = "sim3/geo_from_local.json"
+SIM3 = "sim3/geo_from_local.json"  # the similarity of the solution alone, for other programs
 ADJUSTMENT, SIM3_POSTERIOR = "sim3/adjustment.json", "sim3/adjustment.npz"
 MODEL = "train/model.json"
 TRAIN_POSTERIOR = "train/adjustment.npz"
@@ -42,6 +42,7 @@ CLOUD = "cloud/cloud.laz"
 MESH, MESH_GLB = "mesh/mesh.ply", "mesh/mesh.glb"
 MEASURABLE_SPLAT = "measurable/splat.measurable.ply"
 SPZ = "spz/splat.spz"
+SOG = "sog/lod-meta.json"
 TILES = "tiles/tileset.json"
 TILES_GLB = "tiles/splat.glb"
 HTML = "html/splat.html"
@@ -49,6 +50,7 @@ OPF = "opf/project.opf"
 REPORT_PAGE = "report/report.html"
 CHANGE_FIGURES, CHANGE_PAGE = "change/change.json", "change/change.html"
 LIDAR, LIDAR_MAP = "train/lidar.json", "train/lidar.png"  # only of a training with LiDAR
+HELD_OUT = "train/held_out.npz"  # measured points that it was not given
 BLOCK_RECORD = "train/blocks.json"  # only of a model that was trained in blocks
 BLOCK_PLAN = "plan/plan.json"
 SOLUTION = "solution/solution.json"
@@ -87,9 +89,11 @@ def whole_products(*products: str, optional: bool = False) -> tuple[ProductPart,
     return tuple(ProductPart(product, optional=optional) for product in products)
 
 
-# Photographs count by content, wherever their folder lies. Messages to the user change no result, and points
-# without marks enter none.
-MEASURED = ProductPart(SURVEY, without=("image_dir", "assumptions", "warnings", "unmarked_points"))
+# Photographs count by content, wherever their folder lies; their originals are those of their copies. Messages to
+# the user change no result, and points without marks enter none.
+MEASURED = ProductPart(
+    SURVEY, without=("image_dir", "original_dir", "originals", "assumptions", "warnings", "unmarked_points")
+)
 # The photographs, positions and attitudes, by which `sfm` chooses the pairs to match, and velocities, by which it
 # corrects a rolling shutter. Control points, σ and the split of a survey do not make an SfM model stale.
 PHOTOGRAPHS = ProductPart(
@@ -113,18 +117,21 @@ APPLIED_RIG = ProductPart(
 
 # The solution with its covariances, which is init-sim3's until training goes on from it.
 SOLVED = (
-    *whole_products(SPARSE, SIM3),
+    *whole_products(SPARSE),
     *whole_products(ADJUSTMENT, SIM3_POSTERIOR, MODEL, TRAIN_POSTERIOR, GAUSSIANS, optional=True),
 )
 
 # The area of interest, to which splats are cropped on request.
-CROPPED_BY = whole_products(SPARSE, SIM3, optional=True)
+CROPPED_BY = whole_products(SPARSE, ADJUSTMENT, optional=True)
 
 # The Gaussians that `georef clean` has left, which files of the splat take in place of the trained ones.
 TAKEN = whole_products(CLEANED, optional=True)
 
 # The accuracy of the result, which every file to hand over states.
 HEADLINE = ProductPart(REPORT, fields=("headline",), optional=True)
+
+# What each file of the splat is made from.
+DELIVERED_SPLAT = (MEASURED, *whole_products(MODEL, GAUSSIANS), *TAKEN, *CROPPED_BY, APPLIED_RIG, HEADLINE)
 
 
 @dataclass(frozen=True)
@@ -149,6 +156,7 @@ class StageSpec:
             options)` of `module` decides; without it, `module` makes all products.
         called: words of its command, where they are not its name.
         product_version: of the form of its product; one of another form is made again.
+        delivers: what its command copies out of the workspace: its whole folder, or one file with its sidecars.
     """
 
     name: str
@@ -164,6 +172,7 @@ class StageSpec:
     in_parts: str = ""
     called: str = ""
     product_version: int = 1
+    delivers: Literal["", "file", "folder"] = ""
 
     @property
     def folder(self) -> str:
@@ -224,18 +233,19 @@ PIPELINE: tuple[StageSpec, ...] = (
         module="pipelines.adjust.init_sim3",
         options_place="pipelines.adjust.options:InitSim3Options",
         reads=(MEASURED, *whole_products(SPARSE, POINTS), APPLIED_RIG),
-        product=SIM3,
+        product=ADJUSTMENT,
         title="Estimate the similarity from the SfM model to the Earth.",
-        product_version=2,  # beside the similarity, the adjustment
-        also=(ADJUSTMENT, SIM3_POSTERIOR),
+        product_version=3,  # one document
+        also=(SIM3_POSTERIOR, SIM3),
     ),
     StageSpec(
         name="train",
         module="pipelines.train.stage",
         options_place="pipelines.train.options:TrainOptions",
-        reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT, SIM3_POSTERIOR, POINTS), APPLIED_RIG),
+        reads=(MEASURED, *whole_products(SPARSE, ADJUSTMENT, SIM3_POSTERIOR, POINTS), APPLIED_RIG),
         product=MODEL,
         title="Train the Gaussians with the similarity and the cameras.",
+        product_version=2,  # whose checkpoint has the coordinates about the solution
         resumable=True,
         growing=("iterations",),
         also=(TRAIN_POSTERIOR,),
@@ -246,7 +256,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         name="evaluate",
         module="pipelines.evaluate.stage",
         options_place="pipelines.evaluate.options:EvaluateOptions",
-        reads=(MEASURED, *SOLVED, APPLIED_RIG),
+        reads=(MEASURED, *SOLVED, *whole_products(HELD_OUT, optional=True), APPLIED_RIG),
         product=REPORT,
         title="Measure test views and check points.",
         product_version=4,  # with the area that is measured
@@ -255,9 +265,10 @@ PIPELINE: tuple[StageSpec, ...] = (
         name="export-ply",
         module="pipelines.deliver.ply",
         options_place="pipelines.deliver.options:ExportPlyOptions",
-        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *TAKEN, *CROPPED_BY, APPLIED_RIG, HEADLINE),
+        reads=DELIVERED_SPLAT,
         product=SPLAT,
         title="Write the splat as a PLY with its place on Earth.",
+        delivers="file",
     ),
 )
 
@@ -266,7 +277,7 @@ CLEAN = StageSpec(
     name="clean",
     module="pipelines.clean.stage",
     options_place="pipelines.clean.options:CleanOptions",
-    reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT, MODEL, GAUSSIANS), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE, ADJUSTMENT, MODEL, GAUSSIANS), APPLIED_RIG),
     product=CLEANED,
     title="Remove floaters from the trained model, and make it smaller.",
     also=(CLEANING,),
@@ -274,15 +285,28 @@ CLEAN = StageSpec(
 
 # What a survey hands over besides the PLY: each is made on request, and none is read by another stage.
 # Files that the report lists, with their hashes.
-DELIVERED = (SPLAT, MEASURABLE_SPLAT, "raster/dsm.tif", CLOUD, MESH, SPZ, TILES, HTML, "cameras/cameras.csv", OPF)
+DELIVERED = (
+    SPLAT,
+    MEASURABLE_SPLAT,
+    "raster/dsm.tif",
+    CLOUD,
+    MESH,
+    SPZ,
+    SOG,
+    TILES,
+    HTML,
+    "cameras/cameras.csv",
+    OPF,
+)
 DELIVERABLES: tuple[StageSpec, ...] = (
     StageSpec(
         name="export-measurable",
         module="pipelines.deliver.measurable",
         options_place="pipelines.deliver.options:MeasurableOptions",
-        reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=MEASURABLE_SPLAT,
         title="Write a second PLY whose centres lie on the surface, for viewers that measure by them.",
+        delivers="file",
         resumable=True,
         called="export-ply --measurable",
     ),
@@ -290,9 +314,10 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-raster",
         module="pipelines.deliver.raster",
         options_place="pipelines.deliver.options:ExportRasterOptions",
-        reads=(MEASURED, *whole_products(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product="raster/orthophoto.tif",
         title="Write orthophoto, surface model and σ as rasters.",
+        delivers="folder",
         resumable=True,
         also=("raster/dsm.tif", "raster/measured.tif", "raster/sigma_h.tif", "raster/sigma_v.tif"),
         product_version=2,  # whole inside the area of interest
@@ -301,18 +326,20 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-cloud",
         module="pipelines.deliver.cloud",
         options_place="pipelines.deliver.options:ExportCloudOptions",
-        reads=(MEASURED, *whole_products(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=CLOUD,
         title="Write the surface as a georeferenced point cloud (LAZ).",
+        delivers="file",
         resumable=True,
     ),
     StageSpec(
         name="export-mesh",
         module="pipelines.deliver.mesh",
         options_place="pipelines.deliver.options:ExportMeshOptions",
-        reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS, SIM3), APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=MESH,
         title="Write the surface as a triangle mesh with texture.",
+        delivers="file",
         resumable=True,
         also=(MESH_GLB,),
     ),
@@ -320,17 +347,28 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-spz",
         module="pipelines.deliver.spz",
         options_place="pipelines.deliver.options:ExportSpzOptions",
-        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *TAKEN, *CROPPED_BY, APPLIED_RIG, HEADLINE),
+        reads=DELIVERED_SPLAT,
         product=SPZ,
         title="Write the splat as SPZ, for viewers on the web.",
+        delivers="file",
+    ),
+    StageSpec(
+        name="export-sog",
+        module="pipelines.deliver.sog",
+        options_place="pipelines.deliver.options:ExportSogOptions",
+        reads=DELIVERED_SPLAT,
+        product=SOG,
+        title="Write the splat as streamed SOG, in levels of detail.",
+        delivers="folder",
     ),
     StageSpec(
         name="export-tiles",
         module="pipelines.deliver.tiles",
         options_place="pipelines.deliver.options:ExportTilesOptions",
-        reads=(MEASURED, *whole_products(MODEL, GAUSSIANS), *TAKEN, *CROPPED_BY, APPLIED_RIG, HEADLINE),
+        reads=DELIVERED_SPLAT,
         product=TILES,
         title="Write the splat as 3D Tiles, for web globes.",
+        delivers="folder",
         also=(TILES_GLB,),
     ),
     StageSpec(
@@ -341,12 +379,13 @@ DELIVERABLES: tuple[StageSpec, ...] = (
             MEASURED,
             *whole_products(SPARSE, MODEL, GAUSSIANS),
             *TAKEN,
-            *whole_products(SIM3, SAVED_MEASUREMENTS, optional=True),
+            *whole_products(SAVED_MEASUREMENTS, optional=True),
             APPLIED_RIG,
             HEADLINE,
         ),
         product=HTML,
         title="Write the splat with its viewer as one HTML file.",
+        delivers="file",
     ),
     StageSpec(
         name="export-cameras",
@@ -355,6 +394,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         reads=(MEASURED, *SOLVED, APPLIED_RIG, HEADLINE),
         product="cameras/cameras.csv",
         title="Write the trained cameras for other programs.",
+        delivers="folder",
         also=(
             "cameras/colmap",
             "cameras/transforms.json",
@@ -368,9 +408,10 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         name="export-opf",
         module="pipelines.deliver.opf",
         options_place="pipelines.deliver.options:ExportOpfOptions",
-        reads=(MEASURED, *SOLVED, APPLIED_RIG, HEADLINE),
+        reads=(MEASURED, *SOLVED, *TAKEN, APPLIED_RIG, HEADLINE),
         product=OPF,
-        title="Write cameras, tie points and marks as an OPF project.",
+        title="Write cameras, points, marks and splat as an OPF project.",
+        delivers="folder",
     ),
     StageSpec(
         name="report",
@@ -388,6 +429,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         ),
         product=REPORT_PAGE,
         title="Write the report: one page, and its PDF.",
+        delivers="file",
     ),
 )
 
@@ -404,6 +446,7 @@ CHANGE = StageSpec(
     ),
     product=CHANGE_FIGURES,
     title="Compare two surveys: what changed, by how much, is it real.",
+    delivers="folder",
     also=(
         "change/difference.tif",
         "change/sigma.tif",
@@ -414,18 +457,19 @@ CHANGE = StageSpec(
         "change/regions.csv",
         CHANGE_PAGE,
     ),
-    product_version=3,  # of whole epochs
+    product_version=4,  # of whole epochs, with doubtful regions
 )
 
 # No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in
 # place of those of sfm and init-sim3.
 ADJUST = StageSpec(
     name="adjust",
-    module="pipelines.sfm.pose_prior",
+    module="pipelines.sfm.prior_adjustment",
     options_place="pipelines.sfm.options:AdjustOptions",
     reads=(MEASURED, *whole_products(SPARSE), APPLIED_RIG),
     product="adjust/sparse",
-    also=("adjust/geo_from_local.json", "adjust/adjustment.json", "adjust/adjustment.npz"),
+    also=("adjust/adjustment.json", "adjust/adjustment.npz"),
+    product_version=2,  # one document of the solution
 )
 
 # Parts of a training in blocks, in variants of the workspace: all once, but for those of each block.
@@ -433,21 +477,21 @@ PLAN_BLOCKS = StageSpec(
     name="plan",
     module="pipelines.train.blocks.plan",
     options_place="pipelines.train.options:PlanOptions",
-    reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE, ADJUSTMENT), APPLIED_RIG),
     product=BLOCK_PLAN,
 )
 SOLVE = StageSpec(
     name="solve",
     module="pipelines.train.blocks.solution",
     options_place="pipelines.train.options:SolutionOptions",
-    reads=(MEASURED, *whole_products(SPARSE, SIM3, ADJUSTMENT), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE, ADJUSTMENT), APPLIED_RIG),
     product=SOLUTION,
 )
 TRAIN_SCAFFOLD = StageSpec(
     name="scaffold",
     module="pipelines.train.blocks.scaffold",
     options_place="pipelines.train.options:TrainOptions",
-    reads=(MEASURED, *whole_products(SPARSE, SIM3, SOLUTION), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE, SOLUTION), APPLIED_RIG),
     product=SCAFFOLD,
     resumable=True,
     working=("checkpoint.npz",),
@@ -456,7 +500,7 @@ TRAIN_BLOCK = StageSpec(
     name="block",
     module="pipelines.train.blocks.block",
     options_place="pipelines.train.options:BlockTrainOptions",
-    reads=(MEASURED, *whole_products(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
     product=BLOCK_GAUSSIANS,
     resumable=True,
     growing=("iterations",),
@@ -467,7 +511,7 @@ TRAIN_SEAMS = StageSpec(
     name="seams",
     module="pipelines.train.blocks.seams",
     options_place="pipelines.train.options:SeamOptions",
-    reads=(MEASURED, *whole_products(SPARSE, SIM3, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
+    reads=(MEASURED, *whole_products(SPARSE, BLOCK_PLAN, SOLUTION, SCAFFOLD), APPLIED_RIG),
     product=FIRST_CELL,
     resumable=True,
 )
@@ -478,6 +522,11 @@ BY_NAME = {spec.name: spec for spec in (*PIPELINE, CLEAN, *DELIVERABLES, CHANGE)
 
 
 def producer_of(path: str) -> StageSpec:
+    """Return the stage whose folder a path within a workspace begins with.
+
+    Raises:
+        StopIteration: no stage has the folder.
+    """
     folder = path.split("/", maxsplit=1)[0]
     return next(spec for spec in STAGES if spec.folder == folder)
 
@@ -485,8 +534,8 @@ def producer_of(path: str) -> StageSpec:
 def products_of(spec: StageSpec) -> tuple[str, ...]:
     """Return the products of a stage: its main product, its further ones, and those that other stages require."""
     needed = (part.product for other in PIPELINE for part in other.reads if not part.optional)
-    own = (product for product in needed if producer_of(product) is spec)
-    return tuple(dict.fromkeys((spec.product, *spec.also, *own)))
+    required = (product for product in needed if producer_of(product) is spec)
+    return tuple(dict.fromkeys((spec.product, *spec.also, *required)))
 
 
 def named_deliverables(names: str | None) -> tuple[StageSpec, ...]:

@@ -95,18 +95,18 @@ def stage_config(workspace: Workspace, spec: StageSpec, flags: Flags) -> StageOp
     return resolve(spec.options, tables.get(spec.name, {}), flags, workspace.config_file, stage=spec.name)
 
 
-def why_stale(workspace: Workspace, asked: Request, manifest: Manifest) -> str:
+def why_stale(workspace: Workspace, requested: Request, manifest: Manifest) -> str:
     """Return the reason why a product is stale; empty if its inputs and options are unchanged.
 
     Input files count by content: a path that differs is no other option.
     """
-    if manifest.product_version != asked.spec.product_version:
+    if manifest.product_version != requested.spec.product_version:
         return "made by another version of georef"
-    of_inputs = changed_inputs(asked.inputs.hashes, manifest.inputs)
-    changed = changed_options(asked.options, manifest.config) or of_inputs
+    of_inputs = changed_inputs(requested.inputs.hashes, manifest.inputs)
+    changed = changed_options(requested.options, manifest.config) or of_inputs
     if changed:
         return changed
-    gone = [product for product in products_of(asked.spec) if not (workspace.root / product).exists()]
+    gone = [product for product in products_of(requested.spec) if not (workspace.root / product).exists()]
     return f"{', '.join(gone)} is gone" if gone else ""
 
 
@@ -140,9 +140,9 @@ def found_interrupted(workspace: Workspace, spec: StageSpec) -> str:
     partial = workspace.partial_product(spec)
     options, defaults = _options_of_partial(workspace, spec), spec.options.model_fields
     if options is None:
-        return partial.found()
+        return partial.how_far()
     changed = [name for name in decisive_fields(spec.options) if getattr(options, name) != defaults[name].default]
-    return partial.found() + (f", with {as_flags(options, changed)}" if changed else "")
+    return partial.how_far() + (f", with {as_flags(options, changed)}" if changed else "")
 
 
 def continuing_command(workspace: Workspace, spec: StageSpec) -> str:
@@ -241,13 +241,13 @@ def _state(workspace: Workspace, spec: StageSpec, flags: Flags, memo: Memo, stal
     """Return the state of a stage, which the stale stages upstream make stale."""
     if spec.folder in workspace.lent:  # The runs of the lending workspace keep it current.
         return StageState(spec.name, "current", "")
-    found = finding(workspace, spec, memo)
-    if found.by_hand:
+    product = finding(workspace, spec, memo)
+    if product.by_hand:
         return StageState(spec.name, "current", BY_HAND)
     failure, interrupted = workspace.partial_product(spec).failure(), _interrupted(workspace, spec)
-    if found.unreadable:
-        return StageState(spec.name, "stale", found.unreadable)
-    manifest, damage = found.manifest, why_damaged(found.damaged)
+    if product.unreadable:
+        return StageState(spec.name, "stale", product.unreadable)
+    manifest, damage = product.manifest, why_damaged(product.damaged)
     if manifest is None:
         state: State = "failed" if failure else "interrupted" if interrupted else "missing"
         return StageState(spec.name, state, failure or "", interrupted=interrupted)
@@ -283,6 +283,7 @@ def _interrupted(workspace: Workspace, spec: StageSpec) -> str:
 
 
 def producers(spec: StageSpec) -> list[StageSpec]:
+    """Return the stages whose products a stage reads, each once, in the order in which it reads them."""
     products = (part.product for part in spec.reads if part.product not in OF_NO_STAGE)
     return list(dict.fromkeys(map(producer_of, products)))
 
@@ -325,7 +326,9 @@ def must_exist(workspace: Workspace) -> None:
     """Refuse a workspace that does not exist."""
     require_text(workspace.root)
     if not workspace.root.is_dir():
-        raise InputError("no-workspace", "does not exist. `georef ingest` makes a workspace.", path=workspace.root)
+        raise InputError(
+            "no-workspace", "does not exist.", path=workspace.root, remedy="`georef ingest` makes a workspace."
+        )
 
 
 def warn_of_stale_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> None:
@@ -351,24 +354,24 @@ def refuse_damaged_inputs(workspace: Workspace, spec: StageSpec, memo: Memo) -> 
             raise InputError("product-damaged", message, path=workspace.root)
 
 
-def extendable_product(workspace: Workspace, asked: Request) -> Path | None:
+def extendable_product(workspace: Workspace, requested: Request) -> Path | None:
     """Return the folder of a finished product that differs from the request in growing options only, or None."""
-    spec = asked.spec
-    found = finding(workspace, spec, {}) if spec.growing else Finding()
-    if found.manifest is None or found.damaged:
+    spec = requested.spec
+    product = finding(workspace, spec, {}) if spec.growing else Finding()
+    if product.manifest is None or product.damaged:
         return None
-    changed = changed_options(asked.options, found.manifest.config, but=spec.growing)
-    changed = changed or changed_inputs(asked.inputs.hashes, found.manifest.inputs)
+    changed = changed_options(requested.options, product.manifest.config, but=spec.growing)
+    changed = changed or changed_inputs(requested.inputs.hashes, product.manifest.inputs)
     return None if changed else workspace.root / spec.folder
 
 
-def is_unfinished(workspace: Workspace, asked: Request) -> bool:
+def is_unfinished(workspace: Workspace, requested: Request) -> bool:
     """Return whether an interrupted run for the same request lies there, which a run would go on with.
 
     What a run has left that failed by its nature, such as a training that diverged, leads to the same failure.
     """
-    partial = workspace.partial_product(asked.spec)
-    return asked.spec.resumable and partial.is_of(asked.token) and not partial.is_worthless()
+    partial = workspace.partial_product(requested.spec)
+    return requested.spec.resumable and partial.is_of(requested.token) and not partial.is_worthless()
 
 
 def refuse_loss(
@@ -388,9 +391,10 @@ def refuse_loss(
         how = "" if reason.startswith("option") else " with the former input"
         message = (
             f"holds an interrupted run of {spec.name} ({found_interrupted(workspace, spec)}), which would be lost, "
-            f"because {reason}. `{command}`{how} continues it; --force drops it."
+            f"because {reason}."
         )
-        raise InputError("interrupted-run-lost", message, path=partial.folder, hint=f"{command}, or --force")
+        remedy = f"`{command}`{how} continues it; --force drops it."
+        raise InputError("interrupted-run-lost", message, path=partial.folder, remedy=remedy)
 
 
 def refuse_loss_by_options(workspace: Workspace, spec: StageSpec, options: StageOptions) -> None:

@@ -31,7 +31,7 @@ def require_text(path: Path, field: str | None = None) -> None:
         str(path).encode("utf-8")
     except UnicodeEncodeError as error:
         raise InputError(
-            "name-not-utf8", "has a name that is not UTF-8 text. Rename it.", path=path, field=field
+            "name-not-utf8", "has a name that is not UTF-8 text.", path=path, field=field, remedy="Rename it."
         ) from error
 
 

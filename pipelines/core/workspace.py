@@ -16,6 +16,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from pipelines.core.child import ORPHAN_S
 from pipelines.core.errors import InputError, MissingProductError, WorkspaceBusyError, storage_failures
 from pipelines.core.files import remove, replace_file, replace_folder, replace_text, sync_tree
 from pipelines.core.lock import WriteLock
@@ -56,7 +57,7 @@ class PartialProduct:
         """Return how far an interrupted run came; None if nothing of it is worth keeping."""
         return _text(self.folder / PROGRESS)
 
-    def found(self) -> str:
+    def how_far(self) -> str:
         """Return how far the run came, and when (`1500 of 7000 iterations, 12 min, saved 2026-05-01 14:30`)."""
         progress = self.progress()
         verb, note = ("begun", TOKEN) if progress is None else (f"{progress}, saved", PROGRESS)
@@ -96,10 +97,9 @@ class PartialProduct:
             (self.folder / FAILURE).unlink(missing_ok=True)
             return True
         if insist:
-            message = (
-                "holds an interrupted run with other inputs or options. Give those, or start afresh with --force."
-            )
-            raise InputError("interrupted-run-differs", message, path=self.folder)
+            message = "holds an interrupted run with other inputs or options."
+            remedy = "Give those, or start afresh with --force."
+            raise InputError("interrupted-run-differs", message, path=self.folder, remedy=remedy)
         return False
 
 
@@ -251,7 +251,7 @@ class Workspace:
 
         Errors as of `WriteLock.hold`; and a StorageError: the disk failed while the lock was held.
         """
-        with storage_failures(self.written), WriteLock(self.written).hold(activity):
+        with storage_failures(self.written), WriteLock(self.written).hold(activity, ORPHAN_S):
             for spec in STAGES:
                 final, old = self.written / spec.folder, self.written / f".{spec.folder}.old"
                 if (self.partial(spec) / MANIFEST).exists():  # complete: only the renames are missing
@@ -321,12 +321,13 @@ class Workspace:
 
 def _refuse_what_is_no_folder(folder: Path) -> None:
     if folder.is_symlink():
-        message = (
-            "is a symbolic link, and a stage replaces its folder as a whole. Put the folder itself there, or the "
-            "whole workspace on the other disk."
-        )
-        raise InputError("stage-folder-is-link", message, path=folder)
+        message = "is a symbolic link, and a stage replaces its folder as a whole."
+        remedy = "Put the folder itself there, or the whole workspace on the other disk."
+        raise InputError("stage-folder-is-link", message, path=folder, remedy=remedy)
     if folder.exists() and not folder.is_dir():
         raise InputError(
-            "stage-folder-is-file", "is a file where the stage's folder belongs. Move it away.", path=folder
+            "stage-folder-is-file",
+            "is a file where the stage's folder belongs.",
+            path=folder,
+            remedy="Move it away.",
         )

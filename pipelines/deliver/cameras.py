@@ -24,10 +24,11 @@ from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.files import replace_text
 from pipelines.core.products import Remark, is_checked, save_npz, union
+from pipelines.core.stages import GAUSSIANS
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportCamerasOptions
-from pipelines.deliver.placement import Placement, median_values, place, require_space, scene_sigma
+from pipelines.deliver.placement import Placement, median_values, require_space, scene_sigma, solved_placement
 from pipelines.formats.camera_files import CameraTable, Frame, lens_of, write_camera_table, write_transforms
 from pipelines.formats.cloud_ply import write_point_ply
 from pipelines.formats.colmap import write_sparse
@@ -42,13 +43,15 @@ from pipelines.geometry.intersection import refined_points
 from pipelines.geometry.rotations import omega_phi_kappa_deg, omega_phi_kappa_jacobian, yaw_pitch_roll_deg
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
+from pipelines.splat.gaussians import read_gaussians
 from pipelines.survey.area import LEAST_RAYS, without_outliers
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
 from pipelines.survey.photographs import undistorted_name, write_undistorted
 from pipelines.survey.scene import network_of, photograph_files
+from pipelines.survey.solution import Solution, TrainedModel, read_sfm, read_solution
 from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import TargetCrs, target_crs
-from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_solved
 
 # Components of a camera: rotation about its centre by the axes, rad, then position of the centre, m.
 _COMPONENTS = ("rotation_e", "rotation_n", "rotation_u", "e", "n", "u")
@@ -62,42 +65,42 @@ _UNKNOWN = (
 
 def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
     """Write the cameras in all forms, and return their key figures."""
-    solved = load_solved(stage.workspace)
-    accuracy = headline_of(stage.workspace)
-    points = solved.gaussians.means.numpy() if isinstance(solved, TrainedSurvey) else solved.point_in_model
-    placement = place(solved.model, solved.survey, points, accuracy)
-    centers = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
-    crs = target_crs(options, solved.survey.origin, centers, solved.survey.vertical)
-    _camera_table(solved, None, crs)  # a CRS that cannot hold the cameras is refused before the work begins
-    files = photograph_files(solved.sparse, solved.survey, stage.workspace) if options.undistorted else []
+    solution = read_solution(stage.workspace)
+    sfm, survey = read_sfm(stage.workspace, solution), solution.weighted(load_survey(stage.workspace))
+    accuracy, points = headline_of(stage.workspace), solution.point_in_model(sfm)
+    if isinstance(solution, TrainedModel):
+        points = read_gaussians(stage.workspace.path(GAUSSIANS)).means.numpy()
+    placement = solved_placement(solution, survey, points, accuracy)
+    crs = target_crs(options, survey.origin, solution.center_in_geo, survey.vertical)
+    _camera_table(solution, None, crs)  # a CRS that cannot hold the cameras is refused before the work begins
+    sparse = solution.with_lenses(sfm)
+    files = photograph_files(sparse, survey, stage.workspace) if options.undistorted else []
     pixels = sum(photograph.camera.width * photograph.camera.height for photograph in files)
     what = f"{len(files)} undistorted photographs"
     require_space(stage.out, _JPEG_BYTES_A_PIXEL * pixels, what, "leave out --undistorted")
     with stage.progress.task("cameras", 5) as task:
-        posterior = None
-        if is_checked(solved.model.cautions):
-            posterior = posterior_of(stage.workspace, solved.model, solved.sfm)
-        table = _camera_table(solved, posterior, crs)
+        posterior = posterior_of(stage.workspace, solution, sfm) if is_checked(solution.cautions) else None
+        table = _camera_table(solution, posterior, crs)
         task.advance(note="σ")
-        model = _model_in_file(solved, placement)
+        model = _model_in_file(solution, sfm, placement)
         _write_covariances(stage.out, model, posterior, placement)
         task.advance(note="covariances")
         write_sparse(model, stage.out / "colmap")
         write_sidecar(placement.sidecar(), stage.out / "colmap")
         task.advance(note="COLMAP")
-        splits = {camera.name: camera.split for camera in solved.model.cameras}
+        splits = {camera.name: camera.split for camera in solution.cameras}
         lens_limits = _write_nerfstudio(stage.out / "transforms.json", model, splits, placement)
         task.advance(note="nerfstudio")
         features: list[Json] = []  # GeoJSON cannot state a local frame
         if placement.ecef_from_file is not None:
-            features, corner_lla = _footprints(solved.survey, model, table, placement.ecef_from_file)
+            features, corner_lla = _footprints(survey, model, table, placement.ecef_from_file)
         replace_text(stage.out / "footprints.geojson", features_text(features))
         task.advance(note="footprints")
     if options.undistorted:
         pinholes = write_undistorted(stage.out / "undistorted/images", files, stage.progress)
         write_sparse(undistorted_model(model, pinholes), stage.out / "undistorted/sparse/0")
         write_sidecar(placement.sidecar(), stage.out / "undistorted")
-    cautions, sigma = union(solved.model.cautions, _UNKNOWN if posterior is None else ()), None
+    cautions, sigma = union(solution.cautions, _UNKNOWN if posterior is None else ()), None
     if np.isfinite(table.sigma_enu_m).all():
         east, north, up = table.sigma_enu_m.T
         sigma = scene_sigma("positions of the cameras: similarity, cameras and lens", np.hypot(east, north), up)
@@ -113,7 +116,7 @@ def run(stage: StageRun, options: ExportCamerasOptions) -> Summary:
     return _summary(table, model, sidecar, union(cautions, lens_limits))
 
 
-def _camera_table(solved: SolvedSurvey, posterior: Posterior | None, crs: TargetCrs) -> CameraTable:
+def _camera_table(solution: Solution, posterior: Posterior | None, crs: TargetCrs) -> CameraTable:
     """Return the table of the adjusted cameras in a CRS; σ are NaN without a posterior.
 
     ω, φ, κ count from the axes of the CRS at each camera: grid east, grid north, up along the ellipsoid's normal.
@@ -123,7 +126,7 @@ def _camera_table(solved: SolvedSurvey, posterior: Posterior | None, crs: Target
     Raises:
         InputError: a camera lies outside the domain of the CRS, or its axes are left-handed.
     """
-    cameras, poses, similarity = solved.model.cameras, solved.poses, solved.geo_from_model
+    cameras, poses, similarity = solution.cameras, solution.poses, solution.similarity
     geo_from_cam = similarity.rotation @ np.swapaxes(poses.cam_from_model, 1, 2)
     center_in_geo = similarity.apply(poses.cam_center_in_model)
     # Of (δθ [rad], δc [m]) along the axes of `geo`.
@@ -153,15 +156,15 @@ def _sigma(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.diagonal(propagated, axis1=1, axis2=2)))
 
 
-def _model_in_file(solved: SolvedSurvey, placement: Placement) -> SparseModel:
+def _model_in_file(solution: Solution, sfm: SparseModel, placement: Placement) -> SparseModel:
     """Return the adjusted cameras and lenses in the frame of the placement, with the points as these see them."""
-    file_from_model = placement.file_from_model
-    rotation = solved.poses.cam_from_model @ file_from_model.rotation.T
-    center = file_from_model.apply(solved.poses.cam_center_in_model)
-    points = file_from_model.apply(solved.point_in_model)
-    refined = refined_points(network_of(solved.sparse, CameraPoses(rotation, center), points))
+    file_from_model, poses, sparse = placement.file_from_model, solution.poses, solution.with_lenses(sfm)
+    rotation = poses.cam_from_model @ file_from_model.rotation.T
+    center = file_from_model.apply(poses.cam_center_in_model)
+    points = file_from_model.apply(solution.point_in_model(sfm))
+    refined = refined_points(network_of(sparse, CameraPoses(rotation, center), points))
     return replace(
-        solved.sparse,
+        sparse,
         rotation_cam_from_local=rotation,
         translation_cam_from_local=-np.einsum("nij,nj->ni", rotation, center),
         point_in_local=refined.point_in_world,

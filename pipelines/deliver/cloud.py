@@ -22,17 +22,20 @@ from pipelines.core.types import FloatArray, IntArray, rows_of
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportCloudOptions
 from pipelines.deliver.placement import median_values
-from pipelines.deliver.surface import ground_below, predicted_sigma, surface_views, without_sigma
+from pipelines.deliver.surface import ground_below, predicted_sigma, shared_squares, surface_views, without_sigma
 from pipelines.formats.cloud_ply import CloudPlyWriter, CloudPoints
 from pipelines.formats.copc import write_copc
 from pipelines.formats.georef_sidecar import SceneSigma, median_sigma, write_sidecar
 from pipelines.formats.las import LazWriter
-from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_settings
+from pipelines.surface.fusion import SurfaceCloud, fusion_settings
 from pipelines.surface.ground import GroundModel
 from pipelines.surface.measured_area import area_of
+from pipelines.surface.surface_views import model_renderer
+from pipelines.survey.area import corners, scene_points
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.survey.target_crs import TargetCrs, target_crs
-from pipelines.survey.trained_survey import corners, load_trained, scene_points
 
 GROUND, OTHER = 2, 1  # classes of LAS
 SIGMA_COUNTS = "georeference, disagreement of the training views about the surface, intersection of their rays"
@@ -43,31 +46,35 @@ _LEAST_M, _RATIO, _CLASSES = 1e-4, 1.01, 1700
 
 def run(stage: StageRun, options: ExportCloudOptions) -> Summary:
     """Write the cloud with its sidecar, return its figures; a DegenerateGeometryError: the views agree nowhere."""
-    trained = load_trained(stage.workspace)
-    geo_from_model, box = trained.geo_from_model, corners(scene_points(trained))
-    target = target_crs(options, trained.survey.origin, box, trained.survey.vertical)
+    model = read_trained(stage.workspace)
+    sfm, survey = read_sfm(stage.workspace, model), model.weighted(load_survey(stage.workspace))
+    geo_from_model, box = model.similarity, corners(scene_points(model, sfm))
+    target = target_crs(options, survey.origin, box, survey.vertical)
     middle, crs_from_geo = _middle_and_axes(target, box)
     wkt1 = target.crs.wkt1  # a CRS that LAZ cannot state is refused before the work begins
     laz = stage.out / Path(CLOUD).name
     paths = (laz, laz.with_suffix(".ply")) if options.ply else (laz,)
-    views = surface_views(stage, trained, colours=True)
+    renderer = model_renderer(stage.workspace, model, sfm, survey, progress=stage.progress)
+    views = surface_views(stage, renderer)
     settings = fusion_settings(views, geo_from_model, options.min_views, options.spacing)
-    area = area_of(options, trained, stage.workspace, stage.progress)
-    terrain, warnings = ground_below(views, trained, area, options, stage.progress)
-    grid, no_sigma = predicted_sigma(stage.workspace, trained)
-    squares = fused_squares(views, geo_from_model, settings, stage.progress)
+    area = area_of(options, stage.workspace, model, sfm, survey, progress=stage.progress)
+    terrain, warnings = ground_below(views, geo_from_model, area, options, stage.progress)
+    grid, no_sigma = predicted_sigma(stage.workspace, model, sfm)
+    squares = shared_squares(views, geo_from_model, settings, stage.progress)
     kept = (rows_of(square, area.contains(square.position)) for square in squares)
     points = (_points_in_crs(square, target, crs_from_geo, grid, terrain) for square in kept)
     tally = _write_points(paths, points, target, wkt1, middle)
     if not tally.count:
         raise DegenerateGeometryError(
             "no-surface-points",
-            f"No point of the surface has the same depth in {options.min_views} training views: too few "
-            "photographs overlap, or the training was too short. Add photographs, train longer, or "
-            "lower --min-views.",
+            (
+                f"No point of the surface has the same depth in {options.min_views} training views: too few "
+                "photographs overlap, or the training was too short."
+            ),
+            remedy="Add photographs, train longer, or lower --min-views.",
         )
     empty = "The cloud states no σ, and its dimensions sigma_h, sigma_v and cov_ee to cov_uu are empty"
-    cautions = union(trained.model.cautions, without_sigma(empty, no_sigma))
+    cautions = union(model.cautions, without_sigma(empty, no_sigma))
     sidecar = target.sidecar(tally.bounds, headline_of(stage.workspace), tally.sigma(), cautions)
     if options.copc:
         copc = laz.with_suffix(".copc.laz")

@@ -26,15 +26,17 @@ from pipelines.deliver.splat import codec_arrays, load_splat, splat_values
 from pipelines.deliver.tiles_page import Fact
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.formats.spz import decode_spz, encode_wide_spz
-from pipelines.geometry.cameras import Pinhole, pose_matrix
+from pipelines.geometry.cameras import Camera, CameraPoses, Pinhole, pose_matrix
 from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.gaussians import Gaussians, transformed
 from pipelines.splat.level_of_detail import Tiler, best_cut, build_tiles, scene_box
 from pipelines.splat.metrics import psnr
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.sh import coefficient_count
-from pipelines.survey.trained_survey import SolvedSurvey, load_cameras
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.solution import read_sfm, read_solution
 
 _RESERVED_BYTES = 4000  # for what the page says of the loss
 _TILES = 500  # at least, into which a splat is cut that loses Gaussians: steps of their number
@@ -45,13 +47,17 @@ Measure = Callable[[SplatArrays, SplatArrays], float]
 def run(stage: StageRun, options: ExportHtmlOptions) -> Summary:
     """Write the page; errors as of `load_splat`, or an InputError: too small a limit, or an unfit CRS."""
     splat = load_splat(stage.workspace, options)
-    solved = load_cameras(stage.workspace)
+    solution, survey = read_solution(stage.workspace), load_survey(stage.workspace)
+    sparse = solution.with_lenses(read_sfm(stage.workspace, solution))
     # Readers of SPZ take its axes for right, up and back: whoever takes it out of the page sees it upright.
     whole = codec_arrays(transformed(splat.gaussians, Similarity(1.0, ENU_FROM_Y_UP.T)), options.sh_degree)
-    page = splat_page(stage.workspace, splat.placement, splat.gaussians.means.numpy(), solved, options)
+    centers = splat.gaussians.means.numpy()
+    page = splat_page(
+        stage.workspace, splat.placement, centers, survey, options, poses=solution.poses, sparse=sparse
+    )
     most_bytes = int(options.max_megabytes * 1e6)
     fixed_bytes = len(splat_page_text(page, b"").encode()) + _RESERVED_BYTES
-    measured = _Views(solved, splat.placement, mip_filter=splat.mip_filter).psnr_db
+    measured = _Views(solution.poses, sparse, splat.placement, mip_filter=splat.mip_filter).psnr_db
     held = fitted(whole, (most_bytes - fixed_bytes) * 3 // 4, measured, mip_filter=splat.mip_filter)
     page = page.model_copy(update={"facts": (*page.facts, held.fact), "mip_filter": splat.mip_filter})
     path = stage.out / Path(HTML).name
@@ -68,8 +74,8 @@ def run(stage: StageRun, options: ExportHtmlOptions) -> Summary:
     }
     remark = Remark(
         code="splat-reduced",
-        sentence=f"To stay within {options.max_megabytes:g} MB, the page has {held.sentence}. --max-megabytes sets "
-        "the limit.",
+        sentence=f"To stay within {options.max_megabytes:g} MB, the page has {held.sentence}.",
+        remedy="--max-megabytes sets the limit.",
     )
     return Summary(
         f"{held.count} Gaussians, {size / 1e6:.1f} MB",
@@ -137,8 +143,9 @@ def fitted(whole: SplatArrays, most_bytes: int, psnr_db: Measure, *, mip_filter:
         if len(spz) <= most_bytes:
             return HeldSplat(spz, len(merged), len(whole), 0, own, psnr_db(decode_spz(spz), whole))
         most = min(int(0.95 * most), len(merged) - 1)
-    message = f"The page does not fit, even with {root.count} Gaussians. Give a larger limit."
-    raise InputError("page-too-small", message, field="--max-megabytes")
+    message = f"The page does not fit, even with {root.count} Gaussians."
+    remedy = "Give a larger limit."
+    raise InputError("page-too-small", message, field="--max-megabytes", remedy=remedy)
 
 
 def _degree(splat: SplatArrays) -> int:
@@ -148,14 +155,14 @@ def _degree(splat: SplatArrays) -> int:
 class _Views:
     """Views of some photographs, by which the loss of a splat is measured; both in the axes of SPZ."""
 
-    def __init__(self, solved: SolvedSurvey, placement: Placement, *, mip_filter: bool) -> None:
+    def __init__(self, poses: CameraPoses, sparse: SparseModel, placement: Placement, *, mip_filter: bool) -> None:
         self._backend = rasterizer("cpu", mip_filter=mip_filter)
         axes_from_model = Similarity(1.0, ENU_FROM_Y_UP.T) @ placement.file_from_model
-        rotations = solved.poses.cam_from_model @ axes_from_model.rotation.T
-        centers = axes_from_model.apply(solved.poses.cam_center_in_model)
+        rotations = poses.cam_from_model @ axes_from_model.rotation.T
+        centers = axes_from_model.apply(poses.cam_center_in_model)
         shown = np.unique(np.linspace(0, len(centers) - 1, _VIEWS).round().astype(int))
         self._poses = [torch.tensor(pose_matrix(rotations[i], centers[i]), dtype=torch.float32) for i in shown]
-        self._pinholes = [_pinhole(solved, int(i)).limited(_VIEW_PX) for i in shown]
+        self._pinholes = [_pinhole(sparse.camera_of(int(i))).limited(_VIEW_PX) for i in shown]
 
     def psnr_db(self, held: SplatArrays, whole: SplatArrays) -> float:
         """Return the mean PSNR of the renders of one splat against those of another, on black."""
@@ -177,7 +184,6 @@ def _gaussians(splat: SplatArrays) -> Gaussians:
     return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(part)) for name, part in vars(splat).items()})
 
 
-def _pinhole(solved: SolvedSurvey, camera: int) -> Pinhole:
-    lens = solved.sparse.camera_of(camera)
+def _pinhole(lens: Camera) -> Pinhole:
     focal = lens.mean_focal_px
     return Pinhole(lens.width, lens.height, focal, focal, lens.width / 2, lens.height / 2)

@@ -23,7 +23,7 @@ from pipelines.core.figures import length_text
 from pipelines.core.files import replace_text
 from pipelines.core.manifest import hash_file
 from pipelines.core.products import Product
-from pipelines.core.sentences import without_commands
+from pipelines.core.sentences import without_folders
 from pipelines.core.stages import MODEL, SAVED_MEASUREMENTS
 from pipelines.core.types import Float32Array, Matrix3, Vector3, vector3
 from pipelines.core.workspace import Workspace
@@ -35,16 +35,18 @@ from pipelines.deliver.tiles_page import (
     ShownText,
     facts_of,
     fit_local_crs,
+    page_template,
     scene_extent_m,
     script_json,
 )
 from pipelines.geodesy.crs import parse_crs
+from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.saved_measurements import CLOSED, Kind, NamedMeasurement, Quantity, read_measurements
-from pipelines.survey.survey import SurveyedPoint
+from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.target_crs import TargetCrs, usable_crs
-from pipelines.survey.trained_survey import SolvedSurvey
 
 _TEMPLATES = Path(str(resources.files(__package__))) / "templates"
 RENDERER = _TEMPLATES / "renderer.js.gz"  # made by .ci/renderer.py
@@ -122,16 +124,19 @@ def splat_page(
     workspace: Workspace,
     placement: Placement,
     center_in_file: Float32Array,
-    solved: SolvedSurvey,
+    survey: Survey,
     options: CrsOptions,
+    *,
+    poses: CameraPoses,
+    sparse: SparseModel,
 ) -> SplatPage:
     """Return the content of the page of a splat; an InputError: a CRS that does not fit, or bad measurements.
 
     Args:
         placement: of its frame `file`, which is that of the page.
         center_in_file: (N, 3) centres of its Gaussians, metres.
+        poses, sparse: solved cameras in `model`, and the SfM model with the solved lenses.
     """
-    survey = solved.survey
     middle_in_geo = placement.file_from_geo.inverse().apply(np.zeros((1, 3)))
     target = usable_crs(options, survey.origin, middle_in_geo, survey.vertical)
     radius_m, box_m = scene_extent_m(center_in_file)
@@ -145,8 +150,8 @@ def splat_page(
         title=workspace.root.resolve().name,
         radius_m=radius_m,
         facts=_facts(placement, target),
-        cautions=tuple(filter(None, (without_commands(caution.sentence) for caution in placement.cautions))),
-        cameras=_cameras(solved, placement.file_from_model),
+        cautions=tuple(without_folders(caution.sentence) for caution in placement.cautions),
+        cameras=_cameras(poses, sparse, placement.file_from_model),
         points=tuple(
             SurveyedPlace(name=point.name, kind=kind, at=_places(placement, [point.position_in_geo])[0])
             for kind, points in surveyed.items()
@@ -161,9 +166,9 @@ def splat_page(
 def _facts(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
     """Return the facts of any page, for a reader who has no program to call, and the place on Earth."""
     facts = [
-        Fact(name=fact.name, value=value)
+        Fact(name=fact.name, value=without_folders(fact.value))
         for fact in facts_of(placement, target)
-        if (value := without_commands(fact.value)) and fact.name != "h"
+        if fact.name != "h"
     ]
     if placement.origin_lla is None:
         place = "not on Earth: a local metric frame"
@@ -180,12 +185,12 @@ def _coordinates(placement: Placement, target: TargetCrs, box_m: float) -> tuple
     return tuple(fit_local_crs(each, placement.origin_lla, box) for each in crs)
 
 
-def _cameras(solved: SolvedSurvey, file_from_model: Similarity) -> tuple[PageCamera, ...]:
-    poses, turn = solved.poses, file_from_model.rotation.T
+def _cameras(poses: CameraPoses, sparse: SparseModel, file_from_model: Similarity) -> tuple[PageCamera, ...]:
+    turn = file_from_model.rotation.T
     centers = np.round(file_from_model.apply(poses.cam_center_in_model), _DECIMALS_M)
     found = []
-    for index, name in enumerate(solved.sparse.image_name):
-        lens = solved.sparse.camera_of(index)
+    for index, name in enumerate(sparse.image_name):
+        lens = sparse.camera_of(index)
         x, y, z = np.round(poses.cam_from_model[index] @ turn, _DECIMALS_ROTATION)
         focal_px = lens.mean_focal_px
         found.append(
@@ -233,7 +238,7 @@ def write_splat_page(path: Path, page: SplatPage, spz: bytes) -> None:
 def splat_page_text(page: SplatPage, spz: bytes) -> str:
     """Return the page with the bytes of an SPZ file, whose axes are right, up and back: east, up and south."""
     renderer = gzip.decompress(RENDERER.read_bytes()).decode()
-    text = (_TEMPLATES / "splat.html").read_text(encoding="utf-8")
+    text = page_template("splat.html")
     program = _SCRIPT.search(text)
     assert program is not None
     parts = {

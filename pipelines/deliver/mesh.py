@@ -6,6 +6,7 @@ vertices and their σ, `mesh/mesh.glb`, simplified, with a texture, on request `
 """
 
 import logging
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,34 +19,35 @@ from pipelines.core.machine import free_main_memory_bytes
 from pipelines.core.products import union
 from pipelines.core.progress import Progress
 from pipelines.core.stages import MESH, MESH_GLB
-from pipelines.core.types import FloatArray, joined_rows, rows_of, vector3
+from pipelines.core.types import ByteArray, FloatArray, joined_rows, rows_of, vector3
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportMeshOptions
-from pipelines.deliver.placement import place
-from pipelines.deliver.surface import predicted_sigma, surface_views, without_sigma
+from pipelines.deliver.placement import solved_placement
+from pipelines.deliver.surface import predicted_sigma, shared_squares, surface_views, without_sigma
 from pipelines.formats.georef_sidecar import MeshCrsSidecar, MeshFigures, MeshHole, MeshSidecar, write_sidecar
 from pipelines.formats.mesh_files import write_mesh_glb, write_mesh_obj, write_mesh_ply
 from pipelines.geometry.similarity import Similarity
-from pipelines.surface.fusion import fused_squares, fusion_settings, pixel_on_surface_m
+from pipelines.surface.fusion import fusion_settings, pixel_on_surface_m
 from pipelines.surface.measured_area import area_of
 from pipelines.surface.mesh import (
     Hole,
     RawMesh,
     closed,
     compact,
-    distances,
+    distances_from_mesh,
     holes_of,
     open_share,
     vertex_normals,
     without_islands,
 )
 from pipelines.surface.poisson import MeasuredPoints, closed_gap_m, poisson_mesh, simplified, surface_sigma_at
-from pipelines.surface.surface_views import SurfaceViews
-from pipelines.surface.texture import TexturedMesh, colours_of, textured
+from pipelines.surface.surface_views import SurfaceViews, model_renderer
+from pipelines.surface.texture import TexturedMesh, photographed_colours, textured
 from pipelines.survey.area import Area
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.survey.target_crs import target_crs
-from pipelines.survey.trained_survey import TrainedSurvey, load_trained
 
 _BASE_VOXELS = 4.0  # of the base of a watertight mesh, below its lowest vertex
 _AROUND = 16.0  # spacings around the area: points there hold the surface at its rim
@@ -68,29 +70,41 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
         BackendUnavailableError: a library of the extra is missing.
     """
     require("mesh")
-    trained, progress = load_trained(stage.workspace), stage.progress
-    headline, folder = headline_of(stage.workspace), stage.out
-    placement = place(trained.model, trained.survey, trained.gaussians.means.numpy(), headline)
+    model = read_trained(stage.workspace)
+    sfm, survey = read_sfm(stage.workspace, model), model.weighted(load_survey(stage.workspace))
+    headline, folder, progress = headline_of(stage.workspace), stage.out, stage.progress
+    renderer = model_renderer(stage.workspace, model, sfm, survey, progress=progress)
+    placement = solved_placement(model, survey, renderer.gaussians.means.numpy(), headline)
     geo_from_file = placement.file_from_geo.inverse()
     target = None
     if options.crs is not None:
         middle = geo_from_file.apply(np.zeros((1, 3)))
-        target = target_crs(options, trained.survey.origin, middle, trained.survey.vertical)
-    views = surface_views(stage, trained, colours=True)
-    pixel_m = pixel_on_surface_m(views, trained.geo_from_model)
-    area = area_of(options, trained, stage.workspace, progress)
-    points = _points(views, trained, area, placement.file_from_geo, options=options, progress=progress)
-    surface = _surface(points, area, geo_from_file, options=options, folder=folder, progress=progress)
-    whole, simple = surface.whole, surface.simple
-    surface_faces = len(simple.faces)
-    if options.watertight:
-        base_m = _BASE_VOXELS * points.spacing_m
-        (whole, _), (simple, surface_faces) = closed(whole, base_m), closed(simple, base_m)
-    grid, no_sigma = predicted_sigma(stage.workspace, trained)
-    sigma = _sigma(whole, points, grid, geo_from_file)
-    rgb, _ = colours_of(whole.vertices, vertex_normals(whole), views, placement.file_from_model)
-    texel_m = max(points.spacing_m, pixel_m)
-    shown = textured(simple, views, placement.file_from_model, texel_m, progress, surface_faces=surface_faces)
+        target = target_crs(options, survey.origin, middle, survey.vertical)
+    views = surface_views(stage, renderer)
+    pixel_m = pixel_on_surface_m(views, model.similarity)
+    area = area_of(options, stage.workspace, model, sfm, survey, progress=progress)
+    points = _points(views, model.similarity, area, placement.file_from_geo, options=options, progress=progress)
+    base_m = _BASE_VOXELS * points.spacing_m if options.watertight else None
+    # COLMAP solves and simplifies on one core: the other does meanwhile what needs no result of these.
+    with ThreadPoolExecutor(1) as beside:
+        predicted = beside.submit(predicted_sigma, stage.workspace, model, sfm)
+        beside.submit(lambda: points.tree)
+        whole, islands = _whole(points, area, geo_from_file, options=options, folder=folder, progress=progress)
+        grid, no_sigma = predicted.result()
+        described = beside.submit(
+            _described, whole, points, grid, geo_from_file,
+            views=views, file_from_model=placement.file_from_model, base_m=base_m,
+        )  # fmt: skip
+        holes = beside.submit(holes_of, whole)
+        simple, errors = _simplified(
+            whole, points.spacing_m, beside, options=options, folder=folder, progress=progress
+        )
+        written, sigma, rgb = described.result()
+        covered, surface_faces = (simple, len(simple.faces)) if base_m is None else closed(simple, base_m)
+        texel_m = max(points.spacing_m, pixel_m)
+        shown = textured(covered, views, placement.file_from_model, texel_m, progress, surface_faces=surface_faces)
+        surface = _Surface(whole, simple, *errors.result(), islands, holes.result())
+    whole, simple = written, covered
     views.close()
     cautions = union(placement.cautions, without_sigma("The mesh states no σ of its vertices", no_sigma))
     exact = replace(surface, rms_error_m=0.0, largest_error_m=0.0)
@@ -125,7 +139,7 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
 
 def _points(
     views: SurfaceViews,
-    trained: TrainedSurvey,
+    geo_from_model: Similarity,
     area: Area,
     file_from_geo: Similarity,
     *,
@@ -135,10 +149,10 @@ def _points(
     """Return the fused points in and around the area, in the frame of the file; errors as of `run`."""
     spacing_m = options.voxel
     while True:
-        settings = fusion_settings(views, trained.geo_from_model, options.min_views, spacing_m)
+        settings = fusion_settings(views, geo_from_model, options.min_views, spacing_m)
         west, south, east, north = area.polygon.buffer(_AROUND * settings.spacing_m).bounds
         parts = []
-        for square in fused_squares(views, trained.geo_from_model, settings, progress):
+        for square in shared_squares(views, geo_from_model, settings, progress):
             plan = square.position[:, :2]
             near = ((plan >= (west, south)) & (plan <= (east, north))).all(axis=1)
             # Points whose normals cancel say nothing of the side.
@@ -164,8 +178,11 @@ def _points(
 def _no_surface(options: ExportMeshOptions) -> DegenerateGeometryError:
     return DegenerateGeometryError(
         "no-surface-points",
-        f"No part of the surface has the same depth in {options.min_views} training views: too few photographs "
-        "overlap, or the training was too short. Add photographs, train longer, or lower --min-views.",
+        (
+            f"No part of the surface has the same depth in {options.min_views} training views: too few "
+            "photographs overlap, or the training was too short."
+        ),
+        remedy="Add photographs, train longer, or lower --min-views.",
     )
 
 
@@ -206,7 +223,7 @@ class _Surface:
         return f"{len(self.holes)} holes, the widest of {self.holes[0].width_m:.1f} m"
 
 
-def _surface(
+def _whole(
     points: MeasuredPoints,
     area: Area,
     geo_from_file: Similarity,
@@ -214,35 +231,71 @@ def _surface(
     options: ExportMeshOptions,
     folder: Path,
     progress: Progress,
-) -> _Surface:
-    """Return the mesh of the surface in the area; errors as of `run`."""
+) -> tuple[RawMesh, int]:
+    """Return the mesh of the surface in the area, and the number of islands left out; errors as of `run`."""
     voxel_m = points.spacing_m
-    error_m = voxel_m / 2 if options.simplify_error is None else options.simplify_error
     whole = poisson_mesh(points, voxel_m, folder, progress)
     inside = area.contains(geo_from_file.apply(whole.vertices))
     whole = compact(RawMesh(whole.vertices, whole.faces[inside[whole.faces].all(axis=1)]))
     if not len(whole.faces):
         raise _no_surface(options)
     least_m2 = max(_PART_M2, _PART_VOXELS * voxel_m**2) if options.least_part is None else options.least_part
-    whole, islands = without_islands(whole, least_m2)
+    return without_islands(whole, least_m2)
+
+
+def _described(
+    whole: RawMesh,
+    points: MeasuredPoints,
+    grid: AccuracyGrid | None,
+    geo_from_file: Similarity,
+    *,
+    views: SurfaceViews,
+    file_from_model: Similarity,
+    base_m: float | None,
+) -> tuple[RawMesh, tuple[FloatArray, FloatArray], ByteArray]:
+    """Return the whole mesh, closed where a base is asked for, with σ and colours (V, 3) of its vertices."""
+    if base_m is not None:
+        whole, _ = closed(whole, base_m)
+    normals = vertex_normals(whole)
+    sigma = _sigma(whole.vertices, normals, points, grid, geo_from_file)
+    rgb, _ = photographed_colours(whole.vertices, normals, views, file_from_model)
+    return whole, sigma, rgb
+
+
+def _simplified(
+    whole: RawMesh,
+    voxel_m: float,
+    beside: Executor,
+    *,
+    options: ExportMeshOptions,
+    folder: Path,
+    progress: Progress,
+) -> tuple[RawMesh, Future[tuple[float, float]]]:
+    """Return a mesh simplified, and to come, the RMS and the largest distance of it; errors as of `run`."""
+    error_m = voxel_m / 2 if options.simplify_error is None else options.simplify_error
     simple = simplified(whole, error_m, folder, progress)
-    errors = np.zeros(1)
-    if error_m > 0:
+
+    def errors() -> tuple[float, float]:
         drawn = whole.vertices[:: -(-len(whole.vertices) // _SAMPLE)]
-        errors = distances(drawn, simple, voxel_m)
-    rms_m = float(np.sqrt(np.mean(errors**2)))
-    return _Surface(whole, simple, rms_m, float(errors.max()), islands, holes_of(whole))
+        distances = distances_from_mesh(drawn, simple, voxel_m) if error_m > 0 else np.zeros(1)
+        return float(np.sqrt(np.mean(distances**2))), float(distances.max())
+
+    return simple, beside.submit(errors)
 
 
 def _sigma(
-    mesh: RawMesh, points: MeasuredPoints, grid: AccuracyGrid | None, geo_from_file: Similarity
+    vertices: FloatArray,
+    normals: FloatArray,
+    points: MeasuredPoints,
+    grid: AccuracyGrid | None,
+    geo_from_file: Similarity,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the horizontal and vertical σ (V,) of the vertices in metres, as of the cloud; NaN: unknown."""
     if grid is None:
-        unknown = np.full(len(mesh.vertices), np.nan)
+        unknown = np.full(len(vertices), np.nan)
         return unknown, unknown
-    along = surface_sigma_at(mesh.vertices, points)[:, None] * (vertex_normals(mesh) @ geo_from_file.rotation.T)
-    georeference = np.einsum("vii->vi", grid.cov_at(geo_from_file.apply(mesh.vertices)))
+    along = surface_sigma_at(vertices, points)[:, None] * (normals @ geo_from_file.rotation.T)
+    georeference = np.einsum("vii->vi", grid.cov_at(geo_from_file.apply(vertices)))
     east, north, up = (georeference + along**2).T
     return np.sqrt(east + north), np.sqrt(up)
 
@@ -269,7 +322,10 @@ def _memory_excess(points: int, voxel_m: float, *, stated: bool) -> float:
     if needed > free and (stated or free < _FIXED_BYTES):
         raise ResourceError(
             "mesh-memory",
-            f"The mesh with voxels of {voxel_m:.3f} m may need {needed / 2**30:.1f} GiB of memory; "
-            f"{free / 2**30:.1f} GiB are free. Give a larger --voxel.",
+            (
+                f"The mesh with voxels of {voxel_m:.3f} m may need {needed / 2**30:.1f} GiB of memory; "
+                f"{free / 2**30:.1f} GiB are free."
+            ),
+            remedy="Give a larger --voxel.",
         )
     return _POINT_BYTES * points / max(free - _FIXED_BYTES, 1)

@@ -2,70 +2,97 @@
 
 Reads survey, SfM model, and the adjustment: of the training, or before it of init-sim3. Writes the folder `opf/`
 with `project.opf`: adjusted cameras and lenses, tie points with their observations, measured positions, control and
-check points with their marks (docs/deliverables.md).
+check points with their marks; of a trained model the surface as a point cloud, and the Gaussians
+(docs/deliverables.md).
 
 OPF takes the coordinates of a map for Cartesian ones. Without --crs, the map is a transverse Mercator projection
 around the scene, true to scale at its height: the bundle keeps its shape, and every coordinate its place on Earth.
 """
 
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
-from pipelines.core.errors import InputError
+from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.products import Remark, is_checked, union
-from pipelines.core.stages import OPF
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.stages import MODEL, OPF
+from pipelines.core.types import BoolArray, FloatArray, rows_of
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportOpfOptions
+from pipelines.deliver.splat import load_splat
+from pipelines.deliver.surface import shared_squares, surface_views
 from pipelines.formats.georef_sidecar import write_sidecar
-from pipelines.formats.opf_writer import OpfFrame, OpfPhotograph, OpfPoint, OpfScene, write_opf
+from pipelines.formats.opf_gltf import Json, SurfaceWriter
+from pipelines.formats.opf_writer import (
+    POINT_CLOUD,
+    SPLATS,
+    SPLATS_FORMAT,
+    OpfFrame,
+    OpfPhotograph,
+    OpfPoint,
+    OpfScene,
+    write_opf,
+)
 from pipelines.geodesy.crs import grid_from_enu, grid_scale
 from pipelines.geodesy.enu import SEMI_MAJOR_M, geo_from_enu_at, lla_from_enu
 from pipelines.geodesy.vertical import ELLIPSOIDAL, VerticalChoice
 from pipelines.geometry.intersection import refined_points
+from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
+from pipelines.splat.gaussians import transformed, write_gaussians
+from pipelines.surface.fusion import fusion_settings
+from pipelines.surface.measured_area import area_of
+from pipelines.surface.surface_views import model_renderer
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.scene import network_of
+from pipelines.survey.solution import Solution, read_sfm, read_solution, read_trained
 from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.target_crs import TargetCrs, target_crs
-from pipelines.survey.trained_survey import SolvedSurvey, load_solved
 
 _LENS_TOLERANCE_PX = 0.01
+_MIN_VIEWS = 3  # that agree on a point of the cloud
+_SPLAT = "splat.ply"
+_FAR_M = 20_000.0  # from the middle of the scene
 _SCALE_TOLERANCE = 2e-5  # of a map's scale: 2 cm in 1 km, and 0.04 px across 2000 px
 
 
 def run(stage: StageRun, options: ExportOpfOptions) -> Summary:
     """Write the project; an InputError: a CRS that is no map, or does not reach the scene."""
-    solved = load_solved(stage.workspace)
-    survey = solved.survey
-    center_in_geo = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
+    solution = read_solution(stage.workspace)
+    sfm, survey = read_sfm(stage.workspace, solution), solution.weighted(load_survey(stage.workspace))
+    center_in_geo = solution.center_in_geo
     points_in_geo = center_in_geo
-    if len(solved.point_in_model):
-        points_in_geo = solved.geo_from_model.apply(solved.point_in_model)
+    if len(sfm.point_in_local):
+        points_in_geo = solution.similarity.apply(solution.point_in_model(sfm))
     target = _target(options, survey, center_in_geo, points_in_geo)
     posterior = None
-    if is_checked(solved.model.cautions):
-        posterior = posterior_of(stage.workspace, solved.model, solved.sfm)
+    if is_checked(solution.cautions):
+        posterior = posterior_of(stage.workspace, solution, sfm)
     on_map = _Map(target)
     frame = _frame(on_map, center_in_geo)
+    made, surface, warnings = _made(stage, options, on_map, frame)
     scene = OpfScene(
         name=stage.workspace.root.resolve().name,
         frame=frame,
-        model=_model_on_map(solved, on_map, frame),
-        photographs=_photographs(solved, on_map),
-        points=_points(survey, solved.sparse, on_map),
-        rolling=_rolling(solved.sfm),
+        model=_model_on_map(solution, sfm, on_map, frame),
+        photographs=_photographs(survey, sfm.image_name, on_map),
+        points=_points(survey, sfm, on_map),
+        rolling=_rolling(sfm),
         covariances=None if posterior is None else _covariances(posterior, on_map.turns(center_in_geo)),
+        made=made,
     )
     lens_error_px = write_opf(stage.out, scene)
     accuracy = headline_of(stage.workspace)
     limits = _limits(target, points_in_geo, lens_error_px)
-    cautions = union(solved.model.cautions, limits)
+    cautions = union(solution.cautions, limits)
     xyz = target.xyz_from_geo(center_in_geo)
     sidecar = target.sidecar([xyz.min(axis=0), xyz.max(axis=0)], accuracy, None, cautions)
     write_sidecar(sidecar, stage.out / Path(OPF).name)
@@ -77,13 +104,15 @@ def run(stage: StageRun, options: ExportOpfOptions) -> Summary:
         "control_points": sum(not point.is_check for point in scene.points),
         "check_points": sum(point.is_check for point in scene.points),
         "marks": sum(len(point.marks) for point in scene.points),
+        **surface,
         "lens_error_px": lens_error_px,
         "crs": target.crs.name,
         "heights": target.crs.vertical.name,
         "assumed": "; ".join(target.assumed) or None,
     }
     figure = f"{len(model.image_name)} cameras, {len(model.point_id)} tie points"
-    return Summary(figure, values, cautions=cautions)
+    figure += "".join(f", {count} {name.replace('_', ' ')}" for name, count in surface.items() if count)
+    return Summary(figure, values, warnings, cautions)
 
 
 def _target(options: CrsOptions, survey: Survey, center_in_geo: FloatArray, points_in_geo: FloatArray) -> TargetCrs:
@@ -91,8 +120,9 @@ def _target(options: CrsOptions, survey: Survey, center_in_geo: FloatArray, poin
     if survey.origin is None or options.crs is not None:
         target = target_crs(options, survey.origin, center_in_geo, survey.vertical)
         if target.origin is not None and (target.crs.is_geographic or target.crs.is_geocentric):
-            message = f"OPF needs the CRS of a map, and {target.crs.name} is none. Give a projected one."
-            raise InputError("crs-not-projected", message, field="--crs")
+            message = f"OPF needs the CRS of a map, and {target.crs.name} is none."
+            remedy = "Give a projected one."
+            raise InputError("crs-not-projected", message, field="--crs", remedy=remedy)
         return target
     lat, lon, height = lla_from_enu(np.median(points_in_geo, axis=0), survey.origin).tolist()
     around = (
@@ -145,14 +175,14 @@ def _frame(on_map: _Map, center_in_geo: FloatArray) -> OpfFrame:
     return OpfFrame(on_map.definition, -np.round(np.median(in_metres, axis=0)), on_map.units, swapped)
 
 
-def _model_on_map(solved: SolvedSurvey, on_map: _Map, frame: OpfFrame) -> SparseModel:
+def _model_on_map(solution: Solution, sfm: SparseModel, on_map: _Map, frame: OpfFrame) -> SparseModel:
     """Return the adjusted cameras, lenses and tie points in the processing CRS."""
-    similarity, sparse = solved.geo_from_model, solved.sparse
-    center_in_geo = similarity.apply(solved.poses.cam_center_in_model)
-    rotation = solved.poses.cam_from_model @ similarity.rotation.T @ np.swapaxes(on_map.turns(center_in_geo), 1, 2)
+    similarity, poses, sparse = solution.similarity, solution.poses, solution.with_lenses(sfm)
+    center_in_geo = similarity.apply(poses.cam_center_in_model)
+    rotation = poses.cam_from_model @ similarity.rotation.T @ np.swapaxes(on_map.turns(center_in_geo), 1, 2)
     center = frame.processing(on_map.xyz(center_in_geo))
     # As the adjusted cameras see them; a point that they do not see at all is left out.
-    points = refined_points(network_of(sparse, solved.poses, solved.point_in_model)).point_in_world
+    points = refined_points(network_of(sparse, poses, solution.point_in_model(sfm))).point_in_world
     known: BoolArray = np.asarray(np.isfinite(points).all(axis=1))
     place = np.cumsum(known) - 1
     seen = known[sparse.obs_point]
@@ -170,10 +200,83 @@ def _model_on_map(solved: SolvedSurvey, on_map: _Map, frame: OpfFrame) -> Sparse
     )
 
 
-def _photographs(solved: SolvedSurvey, on_map: _Map) -> list[OpfPhotograph]:
-    images = {image.name: image for image in solved.survey.images}
+def _made(
+    stage: StageRun, options: ExportOpfOptions, on_map: _Map, frame: OpfFrame
+) -> tuple[dict[str, list[Json]], dict[str, int], tuple[Remark, ...]]:
+    """Write what was made of the calibration: resources by type of item, counts, and what is missing, and why."""
+    made: dict[str, list[Json]] = {}
+    counts = {"gaussians": 0, "cloud_points": 0}
+    warnings: tuple[Remark, ...] = ()
+    if not stage.workspace.has(MODEL):
+        return made, counts, warnings
+    counts["gaussians"] = _write_splat(stage, options, on_map, frame)
+    made[SPLATS] = [{"uri": _SPLAT, "format": SPLATS_FORMAT}]
+    if options.cloud:
+        writer, remedy = SurfaceWriter(stage.out, POINT_CLOUD), ""
+        try:
+            with writer:
+                _write_cloud(writer, stage, options, on_map, frame)
+            reason = "" if writer.count else f"no point has the same depth in {_MIN_VIEWS} training views"
+        except (DegenerateGeometryError, InputError) as error:
+            if options.boundary is not None:
+                raise
+            reason, remedy = error.fault, error.remedy
+        if reason:
+            sentence = f"The project has no point cloud: {reason}"
+            warnings = (Remark(code="opf-no-cloud", sentence=sentence, remedy=remedy),)
+        else:
+            made[POINT_CLOUD], counts["cloud_points"] = writer.resources, writer.count
+    return made, counts, warnings
+
+
+def _write_splat(stage: StageRun, options: ExportOpfOptions, on_map: _Map, frame: OpfFrame) -> int:
+    """Write the Gaussians in the processing CRS as a PLY, and return their number.
+
+    Each centre is where the map has it. All shapes, and centres far beyond the scene, where a map may end, follow
+    the similarity of the map in the middle of the scene.
+    """
+    splat = load_splat(stage.workspace, options)
+    geo_from_file, target = splat.placement.file_from_geo.inverse(), on_map.target
+    middle_in_geo = geo_from_file.translation[None]
+    scale = 1.0
+    if target.origin is not None:
+        middle = lla_from_enu(middle_in_geo, target.origin).reshape(-1, 3)
+        scale = float(grid_scale(target.crs, middle)[0])
+    rotation = on_map.turns(middle_in_geo)[0] @ geo_from_file.rotation
+    similarity = Similarity(scale, rotation, frame.processing(on_map.xyz(middle_in_geo))[0])
+    in_file = splat.gaussians.means.numpy()
+    centers, near = similarity.apply(in_file), np.linalg.norm(in_file, axis=1) < _FAR_M
+    centers[near] = frame.processing(on_map.xyz(geo_from_file.apply(in_file[near])))
+    means = torch.from_numpy(centers.astype(np.float32))
+    gaussians = replace(transformed(splat.gaussians, similarity), means=means)
+    write_gaussians(stage.out / _SPLAT, gaussians, mip_filter=splat.mip_filter)
+    return len(gaussians)
+
+
+def _write_cloud(
+    writer: SurfaceWriter, stage: StageRun, options: ExportOpfOptions, on_map: _Map, frame: OpfFrame
+) -> None:
+    """Write the surface of the trained model as `georef export-cloud` finds it, in the processing CRS."""
+    model = read_trained(stage.workspace)
+    sfm, survey = read_sfm(stage.workspace, model), model.weighted(load_survey(stage.workspace))
+    renderer, geo_from_model = (
+        model_renderer(stage.workspace, model, sfm, survey, progress=stage.progress),
+        model.similarity,
+    )
+    with closing(surface_views(stage, renderer)) as views:
+        settings = fusion_settings(views, geo_from_model, _MIN_VIEWS)
+        area = area_of(options, stage.workspace, model, sfm, survey, progress=stage.progress)
+        for square in shared_squares(views, geo_from_model, settings, stage.progress):
+            part = rows_of(square, area.contains(square.position))
+            if len(part.position):
+                turn = on_map.turns(part.position.mean(axis=0)[None])[0]
+                writer.write(frame.processing(on_map.xyz(part.position)), part.normal @ turn.T, part.rgb)
+
+
+def _photographs(survey: Survey, names: Sequence[str], on_map: _Map) -> list[OpfPhotograph]:
+    images = {image.name: image for image in survey.images}
     found = []
-    for name in solved.sparse.image_name:
+    for name in names:
         image = images[name]
         xyz = sigma = None
         if image.fix is not None:
@@ -212,18 +315,20 @@ def _covariances(posterior: Posterior, turns: FloatArray) -> FloatArray:
 
 def _limits(target: TargetCrs, points_in_geo: FloatArray, lens_error_px: float) -> tuple[Remark, ...]:
     """Return what a project cannot hold of this survey."""
-    limits = {}
+    limits = []
     if lens_error_px > _LENS_TOLERANCE_PX:
-        limits["opf-lens-replaced"] = (
+        sentence = (
             f"OPF's lens has one focal length and a polynomial up to r⁶: it is {lens_error_px:.2f} px off at most."
         )
+        limits.append(Remark(code="opf-lens-replaced", sentence=sentence))
     if target.origin is not None:
         middle = lla_from_enu(np.median(points_in_geo, axis=0)[None], target.origin).reshape(-1, 3)
         off = abs(float(grid_scale(target.crs, middle)[0]) - 1)
         if off > _SCALE_TOLERANCE:
-            limits["opf-map-scale"] = (
+            sentence = (
                 f"Lengths on the map {target.crs.name} are {1e6 * off:.0f} ppm off those on the ground, and "
-                "heights are not: programs that take the map for Cartesian see a bundle of another shape. Without "
-                "--crs the map is true to scale."
+                "heights are not: programs that take the map for Cartesian see a bundle of another shape."
             )
-    return tuple(Remark(code=code, sentence=sentence) for code, sentence in limits.items())
+            remedy = "Without --crs the map is true to scale."
+            limits.append(Remark(code="opf-map-scale", sentence=sentence, remedy=remedy))
+    return tuple(limits)

@@ -13,12 +13,12 @@ import numpy as np
 from pipelines.core.descriptions import DESCRIPTIONS
 from pipelines.core.errors import GeorefError
 from pipelines.core.figures import Headline
-from pipelines.core.products import Remark, load_json
-from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, MODEL, REPORT, StageSpec
+from pipelines.core.products import Remark
+from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, REPORT, StageSpec
 from pipelines.core.staleness import StageState, cautions_by_stage, document_of_cautions, status
 from pipelines.core.types import FloatArray, Vector3, vector3
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.placement import place
+from pipelines.deliver.placement import solved_placement
 from pipelines.formats.splat_ply import read_centres
 from pipelines.formats.vector_files import Json, feature, polygon
 from pipelines.geodesy.enu import lla_from_enu
@@ -26,9 +26,9 @@ from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.report import read_report
+from pipelines.survey.solution import read_trained
 from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import usable_crs
-from pipelines.survey.trained_model import TrainedModel
 
 _WITHIN = (0.01, 1 - 0.01)  # quantiles of the Gaussians at the bounds: beyond lie sky, and floaters
 _MOST = 100_000  # Gaussians that the bounds are taken from
@@ -152,10 +152,10 @@ class Overview:
 
 def overview(workspace: Workspace, options: CrsOptions) -> Overview:
     """Return the overview of a trained workspace, its bounds in the CRS of the options; errors as of a `run`."""
-    model = load_json(TrainedModel, workspace.path(MODEL))
+    model = read_trained(workspace)
     survey = load_survey(workspace)
     means = read_centres(workspace.path(GAUSSIANS)).astype(np.float64)
-    placement = place(model, survey, means, headline_of(workspace))
+    placement = solved_placement(model, survey, means, headline_of(workspace))
     report, rows = None, status(workspace)
     with contextlib.suppress(GeorefError):  # not evaluated, or damaged: `georef status` tells
         report = read_report(workspace.path(REPORT))

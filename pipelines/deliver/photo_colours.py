@@ -1,4 +1,4 @@
-"""Colours of the orthophoto's cells from the photographs themselves, at their own resolution.
+"""Colours of the orthophoto's cells from the photographs themselves, at their own resolution; also values of bands.
 
 1. A photograph sees a cell if its depth map shows the surface there, and nothing before it.
 2. The detail of a cell is that of one photograph, the one that sees it best: steeply, closely, near the middle of
@@ -10,24 +10,29 @@
 
 Broad colours are means over blocks of cells that lie on whole multiples of a block in the raster: neighbouring
 windows have the same.
+
+A view's colours are those of `Pictures`: three of one photograph, or one of each lens of a rig (`bands.py`).
 """
 
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from pipelines.deliver.raster_window import RasterSource, places_in_geo
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.exposure import falloff, squared_radius_at
 from pipelines.surface.surface_views import SurfaceView
 from pipelines.survey.photographs import ImageCache, Pinholes
-from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.survey.solution import TrainedModel
 
 BLOCK = 8  # cells along a side of a block, of which broad colours are means
 MARGIN = 4 * BLOCK  # cells around a window that its broad colours depend on
@@ -48,34 +53,81 @@ _SPECK = 5  # cells along the side of the smallest place that something hides
 _BEST = 0.5  # of a block's best weight: photographs below it are not asked for detail there
 
 
+Picture = TypeVar("Picture", bound=NDArray[Any])
+
+
 @dataclass(frozen=True)
 class CellColours:
-    """Colours (3, H, W) of a window, and the camera (H, W) whose detail each cell has; −1: none sees it."""
+    """Colours (C, H, W) of a window, and the camera (H, W) whose detail each cell has; −1: none sees it.
 
-    rgb: ByteArray
+    Colours of a cell that none sees are NaN.
+    """
+
+    colours: Float32Array
     camera: IntArray
+
+
+class Recent(Generic[Picture]):
+    """Pictures used last, by a key, of up to a gibibyte."""
+
+    def __init__(self, read: Callable[[int], Picture]) -> None:
+        self._read, self._held_bytes = read, 0
+        self._held: OrderedDict[int, Picture] = OrderedDict()
+
+    def get(self, key: int) -> Picture:
+        """Return a picture, read if it is not held."""
+        if key in self._held:
+            self._held.move_to_end(key)
+            return self._held[key]
+        picture = self._held[key] = self._read(key)
+        self._held_bytes += picture.nbytes
+        while self._held_bytes > _CACHE_BYTES and len(self._held) > 1:
+            self._held_bytes -= self._held.popitem(last=False)[1].nbytes
+        return picture
+
+
+class Pictures(Protocol):
+    """What the views show, in C channels."""
+
+    @property
+    def moved(self) -> Float32Array:
+        """Differences (C,) from the median of the views beyond which a view shows another thing."""
+
+    def has(self, camera: int) -> bool:
+        """Return whether a camera has a picture."""
+
+    def at(
+        self, camera: int, pinhole: Pinhole, u: Float32Array, v: Float32Array, z: Float32Array
+    ) -> tuple[Float32Array, Float32Array | None]:
+        """Return colours (H, W, C) of a view, and factors (H, W) of its weight; None: all 1.
+
+        Args:
+            camera: of the view.
+            pinhole: of its photograph at full size, under the present lens.
+            u, v: (H, W) places in the undistorted photograph of that size.
+            z: (H, W) depths of what lies there, in metres; 0: none.
+        """
+
+
+def rim_weight(u: Float32Array, v: Float32Array, pinhole: Pinhole) -> Float32Array:
+    """Return 1 inside a picture, falling smoothly to 0 at its rim and outside."""
+    rim = np.minimum(np.minimum(u, pinhole.width - u), np.minimum(v, pinhole.height - v))
+    return np.asarray(np.clip(rim / (_FEATHER * min(pinhole.width, pinhole.height)), 0.0, 1.0), dtype=np.float32)
 
 
 @dataclass(frozen=True)
 class _View:
-    """Photograph of a view at full size, and what undoes its light.
-
-    `colour_of` (3, 4) applies to homogeneous colours of 0 … 255; the vignetting divides what it gives.
-    """
+    """Photograph of a view at full size."""
 
     seen: SurfaceView
     pinhole: Pinhole
-    colour_of: FloatArray
-    vignetting: tuple[float, ...]
     sharpness: float
     unknown: float  # what counts of a pixel without a depth
 
     def weight(self, u: Float32Array, v: Float32Array, z: Float32Array, cosine: Float32Array) -> Float32Array:
         """Return how well cells are seen at pixels (…,): 0 outside the picture, and smooth up to its rim."""
-        pinhole = self.pinhole
-        rim = np.minimum(np.minimum(u, pinhole.width - u), np.minimum(v, pinhole.height - v))
-        inside = np.clip(rim / (_FEATHER * min(pinhole.width, pinhole.height)), 0.0, 1.0)
-        resolution = pinhole.fx / np.maximum(z, 1e-3)
+        resolution = self.pinhole.fx / np.maximum(z, 1e-3)
+        inside = rim_weight(u, v, self.pinhole)
         return np.asarray(inside * self.sharpness * (resolution * cosine**2) ** 2, dtype=np.float32)
 
     def shows(self, u: Float32Array, v: Float32Array, z: Float32Array) -> Float32Array:
@@ -91,18 +143,65 @@ class _View:
         return np.where(z > 0, open_to, np.float32(0.0)).astype(np.float32)
 
 
-class PhotoColours:
-    """Photographs of the training views, for the colours of one raster's cells.
+@dataclass(frozen=True)
+class _Light:
+    """What undoes a photograph's light.
 
-    Memory holds decoded photographs of up to a gibibyte, and the places of one window.
+    `colour_of` (3, 4) applies to homogeneous colours of 0 … 255; the vignetting divides what it gives.
     """
 
-    def __init__(self, trained: TrainedSurvey, source: RasterSource, images: ImageCache) -> None:
-        self._trained, self._source, self._images = trained, source, images
-        self._pinholes = Pinholes(images, trained.sfm.lenses, trained.sparse.lenses)
+    colour_of: FloatArray
+    vignetting: tuple[float, ...]
+
+
+class ColourPictures:
+    """Colours of the training photographs: red, green and blue of 0 … 255, without exposure and vignetting."""
+
+    moved = np.full(3, _MOVED, dtype=np.float32)
+
+    def __init__(self, model: TrainedModel, sfm: SparseModel, source: RasterSource, images: ImageCache) -> None:
+        self._images, self._decoded = images, Recent(images.decoded)
+        self._light: dict[int, _Light] = {}
+        for number, camera in enumerate(source.views.cameras):
+            camera_id = int(sfm.image_camera_id[camera])
+            lens = [each for each in model.vignetting if each.camera_id == camera_id]
+            self._light[camera] = _Light(source.views.light(number), tuple(lens[0].coefficients) if lens else ())
+
+    def has(self, camera: int) -> bool:
+        return camera in self._light
+
+    def at(
+        self, camera: int, pinhole: Pinhole, u: Float32Array, v: Float32Array, z: Float32Array
+    ) -> tuple[Float32Array, None]:
+        """Return colours (H, W, 3) as `Pictures.at` says."""
+        light = self._light[camera]
+        raw = self._images.sampled(camera, self._decoded.get(camera), np.stack([u, v], axis=-1))
+        linear, offset = light.colour_of[:, :3].astype(np.float32), light.colour_of[:, 3].astype(np.float32)
+        colour = raw.astype(np.float32) @ linear.T + offset
+        if light.vignetting:
+            radius2 = squared_radius_at(u, v, pinhole, pinhole)
+            colour /= np.maximum(falloff(radius2, light.vignetting), _DARKEST)[..., None]
+        return np.asarray(colour, dtype=np.float32), None
+
+
+class PhotoColours:
+    """Training views with what they show, for the colours of one raster's cells.
+
+    `images` are the photographs at full size. Memory holds decoded ones of up to a gibibyte, and the places of one
+    window.
+    """
+
+    def __init__(
+        self,
+        model: TrainedModel,
+        sfm: SparseModel,
+        source: RasterSource,
+        images: ImageCache,
+        pictures: Pictures,
+    ) -> None:
+        self._source, self._images, self._pictures = source, images, pictures
+        self._pinholes = Pinholes(images, sfm.lenses, model.with_lenses(sfm).lenses)
         self._views: dict[int, _View] = {}
-        self._decoded: OrderedDict[int, ByteArray] = OrderedDict()
-        self._held_bytes = 0
 
     def window(self, frame: RasterFrame, first: tuple[int, int], height: FloatArray) -> CellColours:
         """Return the colours of a window whose first cell in the raster is at a row and column.
@@ -124,9 +223,9 @@ class PhotoColours:
         base = _between_blocks(low, share, place.shape[:2])
         detail, camera = self._detail(place, views, wanted)
         known = camera >= 0
-        rgb = np.where(known[..., None], np.clip(np.round(base + detail), 0, 255), 0).astype(np.uint8)
+        colours = np.where(known[..., None], base + detail, np.float32(np.nan)).astype(np.float32)
         own = tuple(slice(start, start + size) for start, size in zip(before, height.shape, strict=True))
-        return CellColours(np.moveaxis(rgb[own], 2, 0), camera[own])
+        return CellColours(np.moveaxis(colours[own], 2, 0), camera[own])
 
     def _places(self, frame: RasterFrame, height: FloatArray) -> Float32Array:
         """Return the places (H, W, 3) of cells in `model`; NaN: no surface."""
@@ -147,7 +246,8 @@ class PhotoColours:
         coarse = place[BLOCK // 2 :: BLOCK, BLOCK // 2 :: BLOCK].reshape(-1, 3)
         coarse = coarse[np.isfinite(coarse[:, 0])]
         found = []
-        for number in range(len(self._source.views)) if len(coarse) else ():
+        shown = [number for number, camera in enumerate(self._source.views.cameras) if self._pictures.has(camera)]
+        for number in shown if len(coarse) else ():
             view = self._view(number)
             u, v, z, cosine = self._seen_at(view, coarse)
             weight = np.where(z > 0, view.weight(u, v, z, cosine), 0.0)
@@ -156,13 +256,13 @@ class PhotoColours:
         return [self._view(number) for _, number in sorted(found, reverse=True)[:_MOST_VIEWS]]
 
     def _broad(self, place: Float32Array, views: list[_View]) -> tuple[Float32Array, Float32Array, Float32Array]:
-        """Return the blended colours (h, w, 3) of blocks times their weight, that weight as 0 or 1, and weights.
+        """Return the blended colours (h, w, C) of blocks times their weight, that weight as 0 or 1, and weights.
 
         The weights (V, h, w) are those of each view in each block, without what has moved.
         """
         sparse = place[_EVERY // 2 :: _EVERY, _EVERY // 2 :: _EVERY]
         shape = (place.shape[0] // BLOCK, place.shape[1] // BLOCK)
-        colours = np.full((len(views), *shape, 3), np.nan, dtype=np.float32)
+        colours = np.full((len(views), *shape, len(self._pictures.moved)), np.nan, dtype=np.float32)
         weights = np.zeros((len(views), *shape), dtype=np.float32)
         for number, view in enumerate(views):
             rows, columns = _box(self._reach(view, sparse, BLOCK // _EVERY), BLOCK // _EVERY)
@@ -192,15 +292,16 @@ class PhotoColours:
         factor = np.ones_like(weights)
         if several.any():
             chosen = counted[:, several]
-            away = np.abs(chosen - np.nanmedian(chosen, axis=0)).max(axis=2)
-            factor[:, several] = np.where(away > _MOVED, np.float32(_DISCOUNT), np.float32(1.0))
+            away = (np.abs(chosen - np.nanmedian(chosen, axis=0)) / self._pictures.moved).max(axis=2)
+            factor[:, several] = np.where(away > 1.0, np.float32(_DISCOUNT), np.float32(1.0))
         return factor
 
     def _detail(
         self, place: Float32Array, views: list[_View], wanted: Float32Array
     ) -> tuple[Float32Array, IntArray]:
-        """Return what the best view of each cell shows beyond its broad colour (H, W, 3), and its camera (H, W)."""
-        detail, total = np.zeros((*place.shape[:2], 3), dtype=np.float32), np.zeros(place.shape[:2], np.float32)
+        """Return what the best view of each cell shows beyond its broad colour (H, W, C), and its camera (H, W)."""
+        shape = (*place.shape[:2], len(self._pictures.moved))
+        detail, total = np.zeros(shape, dtype=np.float32), np.zeros(place.shape[:2], np.float32)
         camera = np.full(place.shape[:2], -1, dtype=np.int64)
         best = np.zeros(place.shape[:2], dtype=np.float32)
         highest = wanted.max(axis=0, initial=0.0)
@@ -231,17 +332,14 @@ class PhotoColours:
         return (detail / np.maximum(total, _TINY)[..., None]).astype(np.float32), camera
 
     def _colours(self, view: _View, place: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
-        """Return colours (H, W, 3), 0 … 255, of a view at places (H, W, 3), whether it shows them, and weights."""
+        """Return colours (H, W, C) of a view at places (H, W, 3), whether it shows them, and weights."""
         u, v, z, cosine = self._seen_at(view, place.reshape(-1, 3))
         u, v, z, cosine = (values.reshape(place.shape[:2]) for values in (u, v, z, cosine))
         shown, weight = view.shows(u, v, z), view.weight(u, v, z, cosine)
-        raw = self._images.sampled(view.seen.camera, self._photograph(view.seen.camera), np.stack([u, v], axis=-1))
-        linear, offset = view.colour_of[:, :3].astype(np.float32), view.colour_of[:, 3].astype(np.float32)
-        colour = raw.astype(np.float32) @ linear.T + offset
-        if view.vignetting:
-            radius2 = squared_radius_at(u, v, view.pinhole, view.pinhole)
-            colour /= np.maximum(falloff(radius2, view.vignetting), _DARKEST)[..., None]
-        return np.asarray(colour, dtype=np.float32), np.where(weight > 0, shown, np.float32(0.0)), weight
+        colour, factor = self._pictures.at(view.seen.camera, view.pinhole, u, v, z)
+        if factor is not None:
+            weight = weight * factor
+        return colour, np.where(weight > 0, shown, np.float32(0.0)), weight
 
     def _reach(self, view: _View, place: Float32Array, size: int) -> BoolArray:
         """Return the blocks (h, w) of places (H, W, 3) of which a view may show a part."""
@@ -280,14 +378,9 @@ class PhotoColours:
     def _view(self, number: int) -> _View:
         if number not in self._views:
             seen = self._source.views.view(number)
-            _, colour_of = self._source.views.photograph(number)
-            camera_id = int(self._trained.sparse.image_camera_id[seen.camera])
-            lens = [each for each in self._trained.model.vignetting if each.camera_id == camera_id]
             self._views[number] = _View(
                 seen,
                 self._pinholes.of(seen.camera),
-                colour_of,
-                tuple(lens[0].coefficients) if lens else (),
                 self._sharpness(number),
                 0.0 if self._images.is_masked(seen.camera) else _UNKNOWN,  # what is masked has no depth either
             )
@@ -300,18 +393,6 @@ class PhotoColours:
         fine = float(np.abs(cv2.Laplacian(grey, cv2.CV_32F)).mean())
         broad = float(np.abs(grey - cv2.GaussianBlur(grey, (0, 0), 4.0)).mean())
         return float(np.clip(fine / max(broad, 1e-3), 0.1, 10.0))
-
-    def _photograph(self, camera: int) -> ByteArray:
-        if camera in self._decoded:
-            self._decoded.move_to_end(camera)
-            return self._decoded[camera]
-        image = self._images.decoded(camera)
-        self._decoded[camera] = image
-        self._held_bytes += image.nbytes
-        while self._held_bytes > _CACHE_BYTES and len(self._decoded) > 1:
-            _, dropped = self._decoded.popitem(last=False)
-            self._held_bytes -= dropped.nbytes
-        return image
 
 
 def _box(blocks: BoolArray, size: int) -> tuple[slice, slice]:
@@ -333,7 +414,7 @@ def _block_sums(values: NDArray[np.generic], size: int) -> Float32Array:
 
 
 def _block_means(colour: Float32Array, seen: BoolArray) -> Float32Array:
-    """Return the broad colours (H, W, 3) of a view: means of seen cells over blocks, linearly between these."""
+    """Return the broad colours (H, W, C) of a view: means of seen cells over blocks, linearly between these."""
     total = _block_sums(seen, BLOCK)
     mean = _block_sums(np.where(seen[..., None], colour, 0.0), BLOCK)
     share = (total > 0).astype(np.float32)
@@ -341,8 +422,8 @@ def _block_means(colour: Float32Array, seen: BoolArray) -> Float32Array:
 
 
 def _between_blocks(colour: Float32Array, share: Float32Array, shape: tuple[int, ...]) -> Float32Array:
-    """Return colours (H, W, 3) of cells, linearly between those of the blocks (h, w, 3) whose share (h, w) is 1."""
+    """Return colours (H, W, C) of cells, linearly between those of the blocks (h, w, C) whose share (h, w) is 1."""
     size = (shape[1], shape[0])
     weight = np.maximum(cv2.resize(share, size, interpolation=cv2.INTER_LINEAR), 1e-6)
-    wide = cv2.resize(colour, size, interpolation=cv2.INTER_LINEAR)
+    wide = cv2.resize(colour, size, interpolation=cv2.INTER_LINEAR).reshape(*shape, colour.shape[2])
     return np.asarray(wide / weight[..., None], dtype=np.float32)

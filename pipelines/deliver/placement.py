@@ -22,8 +22,8 @@ from pipelines.geodesy.crs import ECEF, parse_crs
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, moved_pivot
+from pipelines.survey.solution import Solution
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_model import Adjustment
 
 # Columns: x, y and z of a file with y up, along east, north and up: x is east, z south.
 ENU_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -95,7 +95,9 @@ class Placement:
         )
 
 
-def place(model: Adjustment, survey: Survey, points_in_model: ArrayLike, accuracy: Headline | None) -> Placement:
+def solved_placement(
+    model: Solution, survey: Survey, points_in_model: ArrayLike, accuracy: Headline | None
+) -> Placement:
     """Return the placement of a solved model, on Earth unless its frame is local.
 
     Args:

@@ -21,7 +21,7 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import transformed, write_gaussians
 
 # By the axis that points up. Columns: the file's x, y and z, along east, north and up.
-_ENU_FROM_AXES = {"y": ENU_FROM_Y_UP, "-y": ENU_FROM_Y_UP @ np.diag([1.0, -1.0, -1.0])}
+ENU_FROM_AXES = {"y": ENU_FROM_Y_UP, "-y": ENU_FROM_Y_UP @ np.diag([1.0, -1.0, -1.0])}
 
 
 def run(stage: StageRun, options: ExportPlyOptions) -> Summary:
@@ -33,7 +33,7 @@ def run(stage: StageRun, options: ExportPlyOptions) -> Summary:
 
 def write_ply(splat: PlacedSplat, path: Path, options: PlyOptions) -> None:
     """Write a splat as PLY along the axes of the options, and its sidecar."""
-    axes, gaussians = _ENU_FROM_AXES.get(options.up), splat.gaussians
+    axes, gaussians = ENU_FROM_AXES.get(options.up), splat.gaussians
     if axes is not None:
         gaussians = transformed(gaussians, Similarity(1.0, axes.T))
     write_gaussians(path, gaussians, mip_filter=splat.mip_filter)

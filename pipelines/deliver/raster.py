@@ -2,8 +2,9 @@
 
 Reads the survey, the trained model and the initial similarity. Writes `raster/orthophoto.tif`, `dsm.tif`,
 `sigma_h.tif`, `sigma_v.tif` as Cloud Optimized GeoTIFF, each with its sidecar, `hillshade.png` and `preview.png`;
-with `--contours` also `contours.gpkg` and `contours.dxf`. The Gaussians are rendered orthographically, and the
-photographs projected onto that surface, window by window: finished windows survive an interruption.
+with `--contours` also `contours.gpkg` and `contours.dxf`, with `--bands` also `bands.tif`. The Gaussians are
+rendered orthographically, and the photographs projected onto that surface, window by window: finished windows
+survive an interruption.
 """
 
 import json
@@ -20,11 +21,12 @@ from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, union
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import StageRun, Summary
+from pipelines.deliver.bands import BandPictures, band_pictures
 from pipelines.deliver.options import ExportRasterOptions
-from pipelines.deliver.photo_colours import PhotoColours
+from pipelines.deliver.photo_colours import ColourPictures, PhotoColours
 from pipelines.deliver.placement import median_values, require_space, scene_sigma
 from pipelines.deliver.raster_mosaic import Mosaic
-from pipelines.deliver.raster_plan import make_frame, training_pixel_m
+from pipelines.deliver.raster_plan import make_frame
 from pipelines.deliver.raster_window import RasterSource, raster_source
 from pipelines.deliver.surface import without_sigma
 from pipelines.formats.georef_sidecar import CrsSidecar, median_sigma, write_sidecar
@@ -32,15 +34,19 @@ from pipelines.formats.geotiff import RasterFrame, read_reduced
 from pipelines.formats.vector_files import ContourLine, features_text, write_contours_dxf, write_contours_gpkg
 from pipelines.geometry.relief import pale, sunlight
 from pipelines.surface.measured_area import area_of
-from pipelines.survey.area import ground_sampling_m
+from pipelines.surface.surface_views import ModelRenderer, model_renderer
+from pipelines.survey.area import corners, ground_sampling_m, scene_points
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
 from pipelines.survey.scene import photographs
+from pipelines.survey.solution import TrainedModel, read_sfm, read_trained
+from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import TargetCrs, target_crs
-from pipelines.survey.trained_survey import TrainedSurvey, corners, load_trained, scene_points
 
 _DETAIL = 1.5  # training pixels over cells, beyond which a raster shows less than its cells promise
 # Bytes of a cell on the disk at most: colours, height, mask and two σ, as measured, whole and final rasters.
 _BYTES_PER_CELL = 74
+_BYTES_PER_BAND = 10  # of a cell, whole and final, with overviews
 _PICTURE_PX = 2000
 _COLOURED = 0.01, 0.99  # quantiles of the heights at the ends of the colours
 # Of the contour lines.
@@ -54,32 +60,37 @@ _CONTOUR_PX = 6000  # of the surface that lines are drawn of
 
 def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     """Write rasters, pictures and contours, return their figures; a DegenerateGeometryError: no cell was seen."""
-    trained = load_trained(stage.workspace)
-    points, gsd_m, training_gsd_m = scene_points(trained), ground_sampling_m(trained), training_pixel_m(trained)
+    model = read_trained(stage.workspace)
+    sfm, survey = read_sfm(stage.workspace, model), model.weighted(load_survey(stage.workspace))
+    points, gsd_m = scene_points(model, sfm), ground_sampling_m(model, sfm)
     assert gsd_m is not None  # a training has points
-    target = target_crs(options, trained.survey.origin, corners(points), trained.survey.vertical)
-    area = area_of(options, trained, stage.workspace, stage.progress)
+    target = target_crs(options, survey.origin, corners(points), survey.vertical)
+    area = area_of(options, stage.workspace, model, sfm, survey, progress=stage.progress)
     polygon = area.in_crs(target)
     frame = make_frame(polygon.bounds, target, gsd_m, options)
     size = f"{frame.columns} × {frame.rows} cells"
-    needed_bytes = _BYTES_PER_CELL * frame.columns * frame.rows
+    bands = options.bands * (len({each.camera_id for each in survey.companions}) + 2)
+    needed_bytes = (_BYTES_PER_CELL + _BYTES_PER_BAND * bands) * frame.columns * frame.rows
     require_space(stage.out, needed_bytes, f"rasters of {size}", "give a larger --gsd")
-    source, reason, warnings = raster_source(
-        stage, trained, target, frame, area, training_gsd_m=training_gsd_m, options=options
-    )
+    pictures: BandPictures | None = None
+    remarks: tuple[Remark, ...] = ()
+    if options.bands:
+        pictures, remarks = band_pictures(stage.workspace, model, sfm, survey, stage.progress)
+    renderer = model_renderer(stage.workspace, model, sfm, survey, progress=stage.progress)
+    source, reason, warnings = raster_source(stage, renderer, target, frame, area, options=options)
     fill = options.fill if area.is_outline or options.fill == 0 else "all"
     mosaic = Mosaic(
         stage.out / "parts", frame, target, polygon,
         has_terrain=source.terrain is not None, fill=fill, photo_m=gsd_m,
     )  # fmt: skip
     mosaic.render(source, stage.progress)
-    if options.colours == "photographs":
-        _colour(stage, mosaic, trained, source, with_source=options.source)
+    _colour(stage, mosaic, renderer, survey, source, bands=pictures, options=options)
     height = mosaic.sample("dsm")
     if not len(height):
-        message = f"No cell is seen by {options.min_views} training views or more. Lower --min-views."
-        raise DegenerateGeometryError("no-raster-cells", message)
-    sidecar = _sidecar(stage, trained, mosaic, source, height, options=options, no_sigma=reason)
+        message = f"No cell is seen by {options.min_views} training views or more."
+        remedy = "Lower --min-views."
+        raise DegenerateGeometryError("no-raster-cells", message, remedy=remedy)
+    sidecar = _sidecar(stage, model, mosaic, source, height, options=options, no_sigma=reason)
     terrain = sidecar if source.terrain is None else _sidecar_of_terrain(sidecar, mosaic)
     sidecars = {"dtm": terrain, "sigma_dtm": terrain}
     for path, own in mosaic.write(stage.out, lambda name: sidecars.get(name, sidecar), stage.progress):
@@ -98,7 +109,7 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         "rows": frame.rows,
         "gsd": frame.step_x,
         "gsd_photographs_m": gsd_m,
-        "gsd_training_m": training_gsd_m,
+        "gsd_training_m": source.training_gsd_m,
         "crs": target.crs.name,
         "heights": target.crs.vertical.name,
         "units": target.crs.units,
@@ -117,6 +128,7 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         "interpolated": interpolated,
         "photographed": mosaic.photographed(),
         **median_values(sidecar.sigma, "cell"),
+        "bands": [] if pictures is None else [band.description for band in pictures.bands.described()],
         "contour_lines": lines,
         "assumed": "; ".join(target.assumed),
     }
@@ -126,24 +138,36 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
         f"{size} of {frame.step_x:g} {target.crs.units[0]} in {target.crs.name}, {measured:.0%} of "
         f"{delivered_ha:.3g} ha measured, {interpolated:.0%} interpolated"
     )
-    return Summary(figure + median_sigma(sidecar.sigma, "cells"), values, warnings, sidecar.cautions)
+    return Summary(figure + median_sigma(sidecar.sigma, "cells"), values, (*warnings, *remarks), sidecar.cautions)
 
 
 def _colour(
-    stage: StageRun, mosaic: Mosaic, trained: TrainedSurvey, source: RasterSource, *, with_source: bool
+    stage: StageRun,
+    mosaic: Mosaic,
+    renderer: ModelRenderer,
+    survey: Survey,
+    source: RasterSource,
+    *,
+    bands: BandPictures | None,
+    options: ExportRasterOptions,
 ) -> None:
-    """Colour the orthophoto by the photographs, and keep on request which photograph each cell is from."""
-    longest_px = max(max(camera.width, camera.height) for camera in trained.sfm.cameras.values())
-    images = photographs(trained.sfm, trained.survey, stage.workspace, longest_px)
-    mosaic.colour(PhotoColours(trained, source, images), stage.progress)
-    if with_source:
-        mosaic.add_source()
-        replace_text(stage.out / "source.json", json.dumps(["", *trained.sfm.image_name], indent=1))
+    """Colour the orthophoto by the photographs, and on request its bands; keep on request what cells are from."""
+    model, sfm = renderer.model, renderer.sfm
+    longest_px = max(max(camera.width, camera.height) for camera in sfm.cameras.values())
+    images = photographs(sfm, survey, stage.workspace, longest_px)
+    if options.colours == "photographs":
+        shown = PhotoColours(model, sfm, source, images, ColourPictures(model, sfm, source, images))
+        mosaic.colour(shown, stage.progress)
+        if options.source:
+            mosaic.add_source()
+            replace_text(stage.out / "source.json", json.dumps(["", *sfm.image_name], indent=1))
+    if bands is not None:
+        mosaic.add_bands(PhotoColours(model, sfm, source, images, bands), bands.bands, stage.progress)
 
 
 def _sidecar(
     stage: StageRun,
-    trained: TrainedSurvey,
+    model: TrainedModel,
     mosaic: Mosaic,
     source: RasterSource,
     height: FloatArray,
@@ -166,7 +190,7 @@ def _sidecar(
     detail = f"{what} no finer detail than {pixels}, whatever the cell size."
     coarse = (Remark(code="detail-of-training", sentence=detail),) if source.training_px > _DETAIL else ()
     empty = "The rasters state no σ, and sigma_h.tif and sigma_v.tif are empty"
-    cautions = union(trained.model.cautions, (*coarse, *without_sigma(empty, no_sigma)))
+    cautions = union(model.cautions, (*coarse, *without_sigma(empty, no_sigma)))
     return source.target.sidecar(bounds, headline_of(stage.workspace), sigma, cautions)
 
 
@@ -242,10 +266,9 @@ def contour_lines(
     low, high = np.nanquantile(height, [0.0005, 0.9995])
     levels = interval * np.arange(math.ceil(low / interval), math.floor(high / interval) + 1)
     if len(levels) > _MOST_LEVELS:
-        message = (
-            f"The interval makes {len(levels)} contour heights, more than {_MOST_LEVELS}. Give a larger interval."
-        )
-        raise InputError("contour-interval", message, field="--contours")
+        message = f"The interval makes {len(levels)} contour heights, more than {_MOST_LEVELS}."
+        remedy = "Give a larger interval."
+        raise InputError("contour-interval", message, field="--contours", remedy=remedy)
     west, south, east, north = frame.bounds
     step = (east - west) / height.shape[1], (north - south) / height.shape[0]
     x = west + (np.arange(height.shape[1]) + 0.5) * step[0]

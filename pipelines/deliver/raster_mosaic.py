@@ -14,7 +14,8 @@ from scipy.ndimage import label
 from pipelines import __version__
 from pipelines.core.progress import Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.deliver.photo_colours import MARGIN, PhotoColours
+from pipelines.deliver.bands import Bands
+from pipelines.deliver.photo_colours import MARGIN, CellColours, PhotoColours
 from pipelines.deliver.raster_whole import INTERPOLATED, MEASURED, REACH, CoarseCells, SeenCells, whole_cells
 from pipelines.deliver.raster_window import PAINTED, RasterSource, render_window
 from pipelines.formats.georef_sidecar import CrsSidecar
@@ -130,20 +131,36 @@ class Mosaic:
 
     def colour(self, colours: PhotoColours, progress: Progress) -> None:
         """Colour the orthophoto's cells by the photographs that see them; the others keep the splat's colours."""
+        names = ("orthophoto", "source")
+        for window, found in self._of_photographs(colours, "colours of the photographs", names, progress):
+            rgba = read_cells(self._part(self._whole, "orthophoto", window))
+            number = np.where(rgba[3] > 0, found.camera + 1, 0)
+            seen = np.clip(np.round(np.nan_to_num(found.colours)), 0, 255).astype(np.uint8)
+            rgba[:3] = np.where(number > 0, seen, rgba[:3])
+            self._write(self._coloured, window, {"orthophoto": rgba, "source": number[None].astype(np.uint16)})
+
+    def add_bands(self, colours: PhotoColours, bands: Bands, progress: Progress) -> None:
+        """Deliver the bands of a rig on the same cells, of the photographs that see them; the others are empty."""
+        self._kinds["bands"] = RasterKind("float32", bands.described())
+        for window, found in self._of_photographs(colours, "bands", ("bands",), progress):
+            inside = read_cells(self._part(self._whole, "orthophoto", window))[3] > 0
+            values = bands.with_indices(found.colours)
+            self._write(self._coloured, window, {"bands": np.where(inside, values, np.float32(np.nan))})
+
+    def _of_photographs(
+        self, colours: PhotoColours, task_name: str, names: tuple[str, ...], progress: Progress
+    ) -> Iterator[tuple[_Window, CellColours]]:
+        """Yield the windows that lack a part of one of these names, with what photographs show of their cells."""
         windows = list(self._windows())
         whole = [(self._part(self._whole, "dsm", one), one.column, one.row) for one in windows]
         heights = write_vrt("dsm", whole, self.frame, self._kinds["dsm"], {})
-        with progress.task("colours of the photographs", len(windows)) as task:
+        with progress.task(task_name, len(windows)) as task:
             for window in windows:
-                if not all(self._part(self._coloured, name, window).exists() for name in ("orthophoto", "source")):
+                if not all(self._part(self._coloured, name, window).exists() for name in names):
                     part, own, frame = self._around(window, MARGIN)
                     height = read_cells(heights, part)[0].astype(np.float64)
                     found = colours.window(frame, (part[0].start, part[1].start), height)
-                    rgba = read_cells(self._part(self._whole, "orthophoto", window))
-                    number = np.where(rgba[3] > 0, found.camera[own] + 1, 0)
-                    rgba[:3] = np.where(number > 0, found.rgb[:, *own], rgba[:3])
-                    bands = {"orthophoto": rgba, "source": number[None].astype(np.uint16)}
-                    self._write(self._coloured, window, bands)
+                    yield window, CellColours(found.colours[:, *own], found.camera[own])
                 task.advance()
 
     def add_source(self) -> None:

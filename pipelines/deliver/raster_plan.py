@@ -17,12 +17,13 @@ from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.types import FloatArray
 from pipelines.deliver.options import ExportRasterOptions
 from pipelines.formats.geotiff import RasterFrame
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.gaussians import Gaussians, rotation_matrices
 from pipelines.splat.rasterizer.orthographic import PlanSplats
 from pipelines.splat.sh import basis
 from pipelines.survey.area import depths_of_observations
+from pipelines.survey.solution import Solution, TrainedModel
 from pipelines.survey.target_crs import TargetCrs
-from pipelines.survey.trained_survey import TrainedSurvey
 
 _CHUNK = 1 << 17
 _NODES = 5  # along each axis of the scene
@@ -34,12 +35,12 @@ _DILATION_PX2 = 0.3  # of the training, in its pixels
 _LARGEST_DEG = 0.01  # about a kilometre
 
 
-def training_pixel_m(trained: TrainedSurvey) -> float:
+def training_pixel_m(model: TrainedModel, sfm: SparseModel) -> float:
     """Return the median size at the SfM points of a pixel of the photographs as the model was trained with them."""
-    depth_m, focal_px = depths_of_observations(trained)
-    cameras = [trained.sparse.camera_of(index) for index in range(len(trained.sfm.image_name))]
+    depth_m, focal_px = depths_of_observations(model, sfm)
+    cameras = [sfm.camera_of(index) for index in range(len(sfm.image_name))]
     longest_px = np.array([max(camera.width, camera.height) for camera in cameras])
-    reduced = np.maximum(longest_px / trained.model.max_image_size, 1.0)[trained.sfm.obs_image]
+    reduced = np.maximum(longest_px / model.max_image_size, 1.0)[sfm.obs_image]
     return float(np.median(depth_m / focal_px * reduced))
 
 
@@ -58,20 +59,20 @@ def make_frame(
     """
     crs = target.crs
     if crs.is_geocentric:
-        message = f"{crs.name} is geocentric and has no map plane. Give a projected CRS, such as EPSG:32632."
-        raise InputError("crs-geocentric", message, field="--crs")
+        message = f"{crs.name} is geocentric and has no map plane."
+        remedy = "Give a projected CRS, such as EPSG:32632."
+        raise InputError("crs-geocentric", message, field="--crs", remedy=remedy)
     if crs.is_geographic and options.gsd is None:
-        message = (
-            f"{crs.name} has coordinates in {crs.units[0]}s. Give the cell size in that unit, such as "
-            "--gsd 0.000001, or a projected CRS."
-        )
-        raise InputError("gsd-in-degrees", message, field="--gsd")
+        message = f"{crs.name} has coordinates in {crs.units[0]}s."
+        remedy = "Give the cell size in that unit, such as --gsd 0.000001, or a projected CRS."
+        raise InputError("gsd-in-degrees", message, field="--gsd", remedy=remedy)
     if crs.is_geographic and options.gsd is not None and options.gsd > _LARGEST_DEG:
         message = (
-            f"The unit of {crs.name} is the {crs.units[0]}, not the metre, and {options.gsd:g} {crs.units[0]}s are "
-            "more than a kilometre. Give the cell size in that unit, such as --gsd 0.000001."
+            f"The unit of {crs.name} is the {crs.units[0]}, not the metre, and {options.gsd:g} "
+            f"{crs.units[0]}s are more than a kilometre."
         )
-        raise InputError("gsd-too-large", message, field="--gsd")
+        remedy = "Give the cell size in that unit, such as --gsd 0.000001."
+        raise InputError("gsd-too-large", message, field="--gsd", remedy=remedy)
     step = _readable(default_gsd_m / crs.horizontal_unit) if options.gsd is None else options.gsd
     west, south, east, north = bounds
     west, south = np.floor(west / step), np.floor(south / step)
@@ -80,11 +81,11 @@ def make_frame(
     if columns * rows > options.max_pixels:
         enough = step * math.sqrt(columns * rows / options.max_pixels)
         message = (
-            f"A cell size of {step:g} {crs.units[0]} makes {columns} × {rows} = {columns * rows:.3g} cells, more "
-            f"than --max-pixels {options.max_pixels:.3g}. Give --gsd {enough:.2g} or larger, or "
-            "a larger --max-pixels."
+            f"A cell size of {step:g} {crs.units[0]} makes {columns} × {rows} = {columns * rows:.3g} "
+            f"cells, more than --max-pixels {options.max_pixels:.3g}."
         )
-        raise InputError("too-many-cells", message, field="--gsd")
+        remedy = f"Give --gsd {enough:.2g} or larger, or a larger --max-pixels."
+        raise InputError("too-many-cells", message, field="--gsd", remedy=remedy)
     return RasterFrame(crs.wkt1, west * step, north * step, step, step, columns, rows)
 
 
@@ -108,7 +109,7 @@ def dilation_cells2(training_px: float, dilation_px2: float = _DILATION_PX2) -> 
 
 
 def plan_splats(
-    gaussians: Gaussians, trained: TrainedSurvey, target: TargetCrs, frame: RasterFrame, training_px: float
+    gaussians: Gaussians, model: TrainedModel, target: TargetCrs, frame: RasterFrame, training_px: float
 ) -> tuple[PlanSplats, float]:
     """Return Gaussians in columns and rows of a raster's cells and depths, and the level that depths count from.
 
@@ -119,7 +120,7 @@ def plan_splats(
         target: the CRS.
         training_px: size of a training pixel on the ground, in cells.
     """
-    geo_from_model = trained.geo_from_model
+    geo_from_model = model.similarity
     mean_in_geo = geo_from_model.apply(gaussians.means.numpy())
     xyz = np.concatenate(
         [target.xyz_from_geo(mean_in_geo[i : i + _CHUNK]) for i in range(0, len(mean_in_geo), _CHUNK)]
@@ -143,10 +144,8 @@ def plan_splats(
         np.column_stack([column, row, level - xyz[:, 2]]),
         cov,
         torch.sigmoid(gaussians.logit_opacities.double()).numpy()
-        * _faintness(
-            cov * np.outer(metric, metric), dilation_cells2(training_px), mip_filter=trained.model.mip_filter
-        ),
-        _colours_from_above(gaussians, trained),
+        * _faintness(cov * np.outer(metric, metric), dilation_cells2(training_px), mip_filter=model.mip_filter),
+        _colours_from_above(gaussians, model),
     )
     return splats, level
 
@@ -161,10 +160,9 @@ def _derivative(points: FloatArray, target: TargetCrs, frame: RasterFrame) -> Re
     by_geo = np.stack([ends[0] - ends[1], ends[2] - ends[3], ends[4] - ends[5]], axis=-1) / _STEP_M
     by_geo = by_geo / np.array([frame.step_x, -frame.step_y, -1.0])[:, None]
     if not np.isfinite(by_geo).all():
-        message = (
-            f"{target.crs.name} does not cover the scene: its coordinates there are not finite. Give another --crs."
-        )
-        raise DegenerateGeometryError("crs-not-finite", message)
+        message = f"{target.crs.name} does not cover the scene: its coordinates there are not finite."
+        remedy = "Give another --crs."
+        raise DegenerateGeometryError("crs-not-finite", message, remedy=remedy)
     return RegularGridInterpolator(tuple(axes), by_geo.reshape(*3 * (_NODES,), 9))
 
 
@@ -189,13 +187,13 @@ def _faintness(cov: FloatArray, dilation: float, *, mip_filter: bool) -> FloatAr
     return np.asarray(np.sqrt(np.clip(area / np.maximum(face, 1e-300), 0.0, 1.0)))
 
 
-def _colours_from_above(gaussians: Gaussians, trained: TrainedSurvey) -> FloatArray:
+def _colours_from_above(gaussians: Gaussians, solution: Solution) -> FloatArray:
     """Return colours (N, 3) as the training cameras nearest in plan see the Gaussians, averaged over these cameras.
 
     Straight down would be a direction from which an oblique flight has never looked: harmonics say nothing there.
     """
-    geo_from_model = trained.geo_from_model
-    centers_in_model = trained.poses.cam_center_in_model[trained.indices("train")]
+    geo_from_model = solution.similarity
+    centers_in_model = solution.poses.cam_center_in_model[solution.indices("train")]
     tree = cKDTree(geo_from_model.apply(centers_in_model)[:, :2])
     nearest = min(_VIEWS_OF_COLOUR, len(centers_in_model))
     centers = torch.from_numpy(np.ascontiguousarray(centers_in_model))

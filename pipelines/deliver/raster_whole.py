@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
-from pipelines.deliver.raster_window import RasterSource, between_nodes, georeference_sigma, places_in_geo
+from pipelines.deliver.raster_window import RasterSource, between_nodes, georeference_sigma_maps, places_in_geo
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.surface.filling import FilledCells, fill_cells
 from pipelines.surface.ground import GroundModel
@@ -90,7 +90,7 @@ def whole_cells(
     height[taken] = modelled[taken]
     known = inside & np.isfinite(height)
     frame = seen.frame.part(own[1].start, own[0].start, known.shape[1], known.shape[0])
-    georeference_h, georeference_v = georeference_sigma(source, frame, np.where(known, height, np.nan))
+    georeference_h, georeference_v = georeference_sigma_maps(source, frame, np.where(known, height, np.nan))
     # What views do not confirm to a training pixel is known no better than that.
     spread_m = np.hypot(spread * target.crs.height_unit_m, source.training_gsd_m)
     # The place of what lies in a hole is as uncertain as the way to its rim is long.

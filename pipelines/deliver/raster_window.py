@@ -13,17 +13,16 @@ from pipelines.core.products import Remark
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.core.workspace import StageRun
 from pipelines.deliver.options import ExportRasterOptions
-from pipelines.deliver.raster_plan import dilation_cells2, plan_splats, samples_per_cell
+from pipelines.deliver.raster_plan import dilation_cells2, plan_splats, samples_per_cell, training_pixel_m
 from pipelines.deliver.surface import ground_below, predicted_sigma, surface_views
 from pipelines.formats.geotiff import RasterFrame
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.orthographic import PlanSplats, PlanView, render_orthographic
 from pipelines.surface.ground import GroundModel
-from pipelines.surface.surface_views import SurfaceViews
-from pipelines.survey.area import Area
+from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
+from pipelines.survey.area import Area, scene_points
 from pipelines.survey.target_crs import TargetCrs
-from pipelines.survey.trained_survey import TrainedSurvey, scene_points
 
 PAINTED = 128  # alpha of a cell whose colour is known and whose height is not measured
 _SOLID = 0.5  # least opacity of a surface
@@ -77,32 +76,30 @@ class RasterSource:
 
 def raster_source(
     stage: StageRun,
-    trained: TrainedSurvey,
+    renderer: ModelRenderer,
     target: TargetCrs,
     frame: RasterFrame,
     area: Area,
     *,
-    training_gsd_m: float,
     options: ExportRasterOptions,
 ) -> tuple[RasterSource, str, tuple[Remark, ...]]:
     """Return what the windows are made from, the reason why σ is not known, or an empty text, and any warnings.
-
-    The folder of the stage holds the depth maps until the stage ends.
 
     Raises:
         InputError: a photograph cannot be read, or the depth maps do not fit on the disk.
         DegenerateGeometryError: no Gaussian lies within the scene.
     """
-    views = surface_views(stage, trained, colours=options.terrain)
-    terrain, warnings = ground_below(views, trained, area, options, stage.progress)
+    model, sfm, views = renderer.model, renderer.sfm, surface_views(stage, renderer)
+    terrain, warnings = ground_below(views, model.similarity, area, options, stage.progress)
+    training_gsd_m = training_pixel_m(model, sfm)
     training_px = training_gsd_m / (frame.step_x * target.horizontal_unit_m)
-    splats, level = plan_splats(_seen_gaussians(trained, views, area), trained, target, frame, training_px)
-    sigma, no_sigma = predicted_sigma(stage.workspace, trained)
+    splats, level = plan_splats(_seen_gaussians(renderer, views, area), model, target, frame, training_px)
+    sigma, no_sigma = predicted_sigma(stage.workspace, model, sfm)
     source = RasterSource(
         splats=splats,
         level=level,
         views=views,
-        geo_from_model=trained.geo_from_model,
+        geo_from_model=model.similarity,
         target=target,
         sigma=sigma,
         terrain=terrain,
@@ -113,25 +110,23 @@ def raster_source(
     return source, no_sigma, warnings
 
 
-def _seen_gaussians(trained: TrainedSurvey, views: SurfaceViews, area: Area) -> Gaussians:
+def _seen_gaussians(renderer: ModelRenderer, views: SurfaceViews, area: Area) -> Gaussians:
     """Return the Gaussians that reach into the area; far ones may lie outside the domain of the CRS.
 
     Left out are those in the air, through which the training views look at the surface.
     """
-    points, gaussians = scene_points(trained), trained.gaussians
+    points, gaussians = scene_points(renderer.model, renderer.sfm), renderer.gaussians
     west, south, east, north = area.polygon.bounds
     low, high = np.array([west, south, points[:, 2].min()]), np.array([east, north, points[:, 2].max()])
     around = float(np.linalg.norm(high - low)) * np.array([_AROUND, _AROUND, 1.0])  # masts stand above all points
-    in_geo = trained.geo_from_model.apply(gaussians.means.numpy())
+    in_geo = renderer.geo_from_model.apply(gaussians.means.numpy())
     inside = ((in_geo >= low - around) & (in_geo <= high + around)).all(axis=1)
     solid = torch.sigmoid(gaussians.logit_opacities) >= _LEAST_OPACITY
     chosen = gaussians.select(solid & torch.from_numpy(inside))
     if len(chosen) == 0:
-        message = (
-            "No opaque Gaussian lies in the area of interest. Check --boundary, or train again with "
-            "`georef train --force`."
-        )
-        raise DegenerateGeometryError("no-gaussians-in-scene", message)
+        message = "No opaque Gaussian lies in the area of interest."
+        remedy = "Check --boundary, or train again with `georef train --force`."
+        raise DegenerateGeometryError("no-gaussians-in-scene", message, remedy=remedy)
     support = views.support(chosen.means.double().numpy())
     haze = (support.views == 0) & (support.seen_through >= _HAZE_VIEWS)
     return chosen.select(torch.from_numpy(~haze))
@@ -191,7 +186,7 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
     painted = solid | (alpha > _SOLID)
     rgba[:3] = np.where(painted, np.moveaxis(np.round(255 * rgb), 2, 0), 0)
     rgba[3] = np.where(solid, 255, np.where(painted, PAINTED, 0))
-    sigma_h, sigma_v = georeference_sigma(source, frame, height)
+    sigma_h, sigma_v = georeference_sigma_maps(source, frame, height)
     sigma_h, sigma_v = np.hypot(sigma_h, noise_h_m), np.hypot(sigma_v, noise_up_m)
     return WindowCells(rgba, height, modelled, np.where(solid, sigma_h, np.nan), np.where(solid, sigma_v, np.nan))
 
@@ -288,7 +283,7 @@ def _quadratic(x: FloatArray) -> FloatArray:
     return np.column_stack([np.ones(len(x)), x, *products])
 
 
-def georeference_sigma(
+def georeference_sigma_maps(
     source: RasterSource, frame: RasterFrame, height: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return σ_H and σ_V (H, W) of the georeference in metres; NaN: not known."""

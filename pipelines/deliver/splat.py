@@ -22,7 +22,7 @@ from pipelines.core.staleness import is_made_from
 from pipelines.core.types import BoolArray, Float32Array, FloatArray, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.options import SplatOptions, WebSplatOptions
-from pipelines.deliver.placement import Placement, place
+from pipelines.deliver.placement import Placement, solved_placement
 from pipelines.formats.splat_ply import SplatArrays, read_centres, read_logit_opacities
 from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.sh import coefficient_count
@@ -31,7 +31,7 @@ from pipelines.survey.block_plan import BlockRecord
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
 from pipelines.survey.options import CropOptions
-from pipelines.survey.trained_model import TrainedModel
+from pipelines.survey.solution import TrainedModel, read_trained
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +120,7 @@ def splat_values(splat: PlacedSplat | SplatParts) -> dict[str, object]:
 def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
     """Return the splat of a workspace, placed on Earth; a DegenerateGeometryError: no Gaussian is opaque enough."""
     path, origin = model_to_deliver(workspace, options)
-    model = load_json(TrainedModel, workspace.path(MODEL))
+    model = read_trained(workspace)
     placement = _placement_of(workspace, model)
     splat = placed_splat(read_gaussians(path), placement, options, crop_of(workspace, options))
     return replace(splat, model=origin, mip_filter=model.mip_filter)
@@ -128,7 +128,7 @@ def load_splat(workspace: Workspace, options: SplatOptions) -> PlacedSplat:
 
 def _placement_of(workspace: Workspace, model: TrainedModel) -> Placement:
     survey = load_survey(workspace)
-    return place(model, survey, read_centres(workspace.path(GAUSSIANS)), headline_of(workspace))
+    return solved_placement(model, survey, read_centres(workspace.path(GAUSSIANS)), headline_of(workspace))
 
 
 def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatParts:
@@ -137,7 +137,7 @@ def load_splat_parts(workspace: Workspace, options: WebSplatOptions) -> SplatPar
     centers, crop = read_centres(path), crop_of(workspace, options)
     chosen = _chosen(centers, read_logit_opacities(path), options, crop)
     _require_any(chosen, options)
-    placement = _placement_of(workspace, load_json(TrainedModel, workspace.path(MODEL)))
+    placement = _placement_of(workspace, read_trained(workspace))
     center_in_file = placement.file_from_model.apply(centers[chosen]).astype(np.float32)
     whole = (slice(0, len(centers)),)
     rows = whole if origin == "cleaned" else _rows_of_blocks(workspace, len(centers))
@@ -158,7 +158,9 @@ def _rows_of_blocks(workspace: Workspace, count: int) -> tuple[slice, ...]:
     numbers = [block.training.gaussians_in_cell for block in load_json(BlockRecord, record).blocks]
     ends = np.cumsum([0, *numbers]).tolist()
     if ends[-1] != count:
-        message = f"The blocks have {ends[-1]} Gaussians, and {GAUSSIANS} has {count}. Run `georef blocks` again."
+        message = (
+            f"The blocks have {ends[-1]} Gaussians, and {GAUSSIANS} has {count}. Run `georef train --force` again."
+        )
         raise InputError("blocks-mismatch", message, path=record)
     return tuple(slice(first, last) for first, last in itertools.pairwise(ends))
 

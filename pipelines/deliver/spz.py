@@ -53,8 +53,9 @@ def run(stage: StageRun, options: ExportSpzOptions) -> Summary:
 def _georeference(sidecar: GeorefSidecar, version: SpzVersion) -> SpzGeoreference:
     """Return the sidecar's place for the file itself; an InputError: the version or the frame has none."""
     if version != 4:
-        message = "Only version 4 of SPZ holds a georeference. Add --spz-version 4."
-        raise InputError("spz-version", message, field="--embed-georeference")
+        message = "Only version 4 of SPZ holds a georeference."
+        remedy = "Add --spz-version 4."
+        raise InputError("spz-version", message, field="--embed-georeference", remedy=remedy)
     if sidecar.crs_id is None:
         message = "The survey has a local metric frame: there is no place on Earth to embed."
         raise InputError("not-on-earth", message, field="--embed-georeference")

@@ -106,10 +106,13 @@ def run(stage: StageRun, options: ExportTilesOptions) -> Summary:
     if finest < count:
         sentence = (
             f"The finest tiles show {finest} merged Gaussians instead of all {count}: with these, the levels of "
-            f"{TILESET} would exceed the --budget of {options.budget} that a viewer can hold. `georef clean "
-            "--gaussians` makes a smaller model with less loss; viewers with more memory take a larger --budget"
+            f"{TILESET} would exceed the budget of {options.budget} that a viewer can hold."
         )
-        warnings.append(Remark(code="tiles-coarser", sentence=sentence))
+        remedy = (
+            "`georef clean --gaussians` makes a smaller model with less loss; viewers with more memory take a "
+            "larger --budget."
+        )
+        warnings.append(Remark(code="tiles-coarser", sentence=sentence, remedy=remedy))
     return Summary(
         f"{count} Gaussians, {len(tiles)} tiles, {size / 2**20:.0f} MiB; all {len(levels)} levels: "
         f"{values['held']} Gaussians",
@@ -128,7 +131,7 @@ def _page(workspace: Workspace, splat: SplatParts, options: ExportTilesOptions) 
         if options.crs is not None or options.vertical is not None:
             raise
         # The tiles themselves need no grid: without one, the page shows ellipsoidal heights, and says so.
-        reason = f"heights are ellipsoidal, because {error}"
+        reason = f"heights are ellipsoidal, because {error.fault}"
         target = without_grid(options, survey.origin, middle_in_geo, survey.vertical, reason)
     return scene_page(
         workspace.root.resolve().name,

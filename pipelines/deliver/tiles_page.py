@@ -1,8 +1,8 @@
 """The page `index.html` beside a tileset: CesiumJS shows it with coordinates, scale bar and surveyed points.
 
-The page's program is the template `tiles.html`; a scene enters it as one JSON document. It needs a web server, the
-tiles and CesiumJS, and loads nothing else: no account, no imagery, no terrain. Its own policy enforces that: it
-runs its own script, by its hash, and CesiumJS.
+The page's program is the template `tiles.html` with `page.js`, which the page of a splat has, too; a scene enters
+it as one JSON document. It needs a web server, the tiles and CesiumJS, and loads nothing else: no account, no
+imagery, no terrain. Its own policy enforces that: it runs its own script, by its hash, and CesiumJS.
 """
 
 import base64
@@ -41,6 +41,7 @@ from pipelines.survey.target_crs import TargetCrs
 PAGE, TILESET = "index.html", Path(TILES).name
 _PLACEHOLDER, _POLICY = '{"to be filled": "page.py"}', "to be filled: page.py"
 _SCRIPT = re.compile(r"<script>(.*?)</script>", re.DOTALL)
+_SHARED = "// to be filled: page.js"
 # The first view shows these of the Gaussians: single ones of the sky or of a far background lie kilometres away.
 _SHOWN = 0.75
 _LEAST_RADIUS_M = 1.0
@@ -178,9 +179,16 @@ def scene_extent_m(center_in_file: Float32Array) -> tuple[float, float]:
 
 def write_scene_page(page: ScenePage, folder: Path) -> None:
     """Write the page into a folder, whole or not at all; an OSError: it cannot be written."""
-    program = resources.files(__package__).joinpath("templates", "tiles.html").read_text(encoding="utf-8")
+    program = page_template("tiles.html")
     program = program.replace(_POLICY, html.escape(_policy(program, page.cesium)), 1)
     replace_text(folder / PAGE, program.replace(_PLACEHOLDER, script_json(page), 1))
+
+
+def page_template(name: str) -> str:
+    """Return the template of a page with the script in it that pages of splats and of tiles share."""
+    templates = resources.files(__package__).joinpath("templates")
+    shared = templates.joinpath("page.js").read_text(encoding="utf-8")
+    return templates.joinpath(name).read_text(encoding="utf-8").replace(_SHARED, shared.rstrip("\n"), 1)
 
 
 def script_json(page: Product) -> str:
@@ -220,7 +228,7 @@ def facts_of(placement: Placement, target: TargetCrs) -> tuple[Fact, ...]:
         ("CRS", target.crs.name),
         ("Heights", f"{target.crs.vertical.described}; of the survey's input: {placement.vertical.described}"),
         ("h", "height above the WGS84 ellipsoid; labels stand at it, too"),
-        ("Accuracy", "not known: nothing states it yet (georef evaluate)" if accuracy is None else accuracy.text),
+        ("Accuracy", "not known: nothing states it yet" if accuracy is None else accuracy.text),
         *(("Assumed", sentence) for sentence in target.assumed),
     )
     return tuple(Fact(name=name, value=value) for name, value in facts)

@@ -1,4 +1,4 @@
-"""Surveyed points, measured in the solved survey: check points, cross-validation, and residuals of the fit.
+"""Surveyed points, measured by the solution: check points, cross-validation, and residuals of the fit.
 
 Each is a section of the report, with errors, accuracy after ASPRS, and predicted accuracy. Cautions name predicted
 σ that check points reject, and check points close to control points.
@@ -23,9 +23,9 @@ from pipelines.geometry.statistics import chi2_quantile, residual_stats
 from pipelines.surface.picking import DepthMap, depth_around, points_on_surface
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey import report
-from pipelines.survey.marks import MarkRays, mark_rays
+from pipelines.survey.marks import MarkRays, mark_rays, triangulated_points
+from pipelines.survey.solution import Solution, fix_differences
 from pipelines.survey.survey import Survey, SurveyedPoint
-from pipelines.survey.trained_survey import SolvedSurvey, fix_differences, triangulated_points
 
 
 @dataclass(frozen=True)
@@ -147,13 +147,13 @@ def _predicted_sigma(measured: RemeasuredPoints) -> report.PredictedSigma | None
 
 
 def triangulated_check_points(
-    solved: SolvedSurvey, posterior: Posterior, area_km2: float | None = None
+    survey: Survey, posterior: Posterior, area_km2: float | None = None
 ) -> report.CheckPointErrors:
     """Return the errors of the check points as intersections of their marks' rays, with their predicted σ."""
-    points, rays = solved.survey.check_points, mark_rays(solved.survey.check_points, solved.sparse)
-    position = triangulated_points(solved, rays)
+    points, rays = survey.check_points, mark_rays(survey.check_points, posterior.sparse)
+    position = triangulated_points(posterior.solution, rays)
     cov = posterior.of_marked_points(position, rays) if points else None
-    accused, joint = np.zeros(len(points), dtype=bool), jointly_checked(solved, posterior)
+    accused, joint = np.zeros(len(points), dtype=bool), jointly_checked(survey, posterior)
     if joint is not None:
         wrong = compress(joint.names, find_blunders(joint.error_in_geo, joint.cov).wrong)
         accused = np.isin([point.name for point in points], tuple(wrong))
@@ -175,13 +175,13 @@ class JointErrors:
         return JointErrors(tuple(compress(self.names, kept)), self.error_in_geo[kept], self.cov[np.ix_(axes, axes)])
 
 
-def jointly_checked(solved: SolvedSurvey, posterior: Posterior) -> JointErrors | None:
+def jointly_checked(survey: Survey, posterior: Posterior) -> JointErrors | None:
     """Return the errors of the check points that have a predicted σ; None: there is no such point."""
-    points = solved.survey.check_points
+    points = survey.check_points
     if not points:
         return None
-    rays = mark_rays(points, solved.sparse)
-    position = triangulated_points(solved, rays)
+    rays = mark_rays(points, posterior.sparse)
+    position = triangulated_points(posterior.solution, rays)
     variance = np.diagonal(posterior.of_marked_points(position, rays), axis1=1, axis2=2)
     known = np.asarray(np.isfinite(position + variance).all(axis=1))
     if not known.any():
@@ -194,35 +194,33 @@ def jointly_checked(solved: SolvedSurvey, posterior: Posterior) -> JointErrors |
 
 
 def check_points_on_surface(
-    renderer: ModelRenderer, progress: Progress, area_km2: float | None = None
+    points: tuple[SurveyedPoint, ...], renderer: ModelRenderer, progress: Progress, area_km2: float | None = None
 ) -> report.CheckPointErrors:
     """Return the errors of the check points as places of the Gaussians' surface behind their marks."""
-    trained = renderer.trained
-    points, rays = trained.survey.check_points, mark_rays(trained.survey.check_points, trained.sparse)
-    maps: list[DepthMap] = []
+    rays, maps = mark_rays(points, renderer.sparse), list[DepthMap]()
     with progress.task("depth at marks", len(rays.point)) as task:
         for camera, xy in zip(rays.camera, rays.xy, strict=True):
             maps.append(depth_around(renderer, int(camera), xy))
             task.advance()
-    position = points_on_surface(trained, rays, maps)
+    position = points_on_surface(renderer.model, rays, maps)
     return check_point_errors(_compared(points, position, rays), area_km2)
 
 
-def cross_validate(solved: SolvedSurvey) -> report.CrossValidation:
+def cross_validate(survey: Survey, posterior: Posterior) -> report.CrossValidation:
     """Return the errors of the control points, each measured by a solution without that point.
 
     The adjustment has stored them. The covariance is that of the solution and the marks: the survey's own is
     subtracted. The error is NaN for a point that entered no solution, or if the others determine none.
     """
-    points = solved.survey.control_points
+    points = survey.control_points
     error, cov = np.full((len(points), 3), np.nan), np.full((len(points), 3, 3), np.nan)
-    left_out = {row.name: row for row in solved.model.measurements if row.kind == "control point"}
+    left_out = {row.name: row for row in posterior.solution.measurements if row.kind == "control point"}
     for index, point in enumerate(points):
         row = left_out.get(point.name)
         if row is not None and row.left_out_error_m is not None and row.left_out_cov_m2 is not None:
             error[index] = row.left_out_error_m
             cov[index] = np.array(row.left_out_cov_m2) - np.array(point.cov_in_geo)
-    measured = RemeasuredPoints(points, error, mark_rays(points, solved.sparse).marks_of_point, cov)
+    measured = RemeasuredPoints(points, error, mark_rays(points, posterior.sparse).marks_of_point, cov)
     assessment = _assess(measured)  # without a class, because control points are not check points
     impossible = "no control point can be spared, or none entered the adjustment"
     return report.CrossValidation(
@@ -237,29 +235,29 @@ def _compared(
     return RemeasuredPoints(points, position_in_geo - surveyed, rays.marks_of_point, cov)
 
 
-def control_residuals(solved: SolvedSurvey) -> report.ControlResiduals:
+def control_residuals(survey: Survey, posterior: Posterior) -> report.ControlResiduals:
     """Return the residuals of the control points: the fit of the solution, not its accuracy."""
-    points = solved.survey.control_points
-    rays = mark_rays(points, solved.sparse)
-    measured = _compared(points, triangulated_points(solved, rays), rays)
-    rejected = np.isin([point.name for point in points], solved.model.control_outliers)
+    points, solution = survey.control_points, posterior.solution
+    rays = mark_rays(points, posterior.sparse)
+    measured = _compared(points, triangulated_points(solution, rays), rays)
+    rejected = np.isin([point.name for point in points], solution.control_outliers)
     stats = residual_stats(measured.error_in_geo[measured.is_measured & ~rejected])
     return report.ControlResiduals(**stats.model_dump(), outliers=int(rejected.sum()), points=_residuals(measured))
 
 
-def fix_residuals(solved: SolvedSurvey) -> report.FixResiduals:
+def fix_residuals(survey: Survey, solution: Solution) -> report.FixResiduals:
     """Return the residuals of the fixes without outliers: the fit of the solution, not its accuracy."""
-    fixes = fix_differences(solved)
+    fixes = fix_differences(solution, survey)
     stats = residual_stats(fixes.difference_in_geo[~fixes.is_outlier])
     return report.FixResiduals(**stats.model_dump(), outliers=int(fixes.is_outlier.sum()))
 
 
-def distance_errors(solved: SolvedSurvey, posterior: Posterior) -> tuple[report.DistanceError, ...]:
+def distance_errors(survey: Survey, posterior: Posterior) -> tuple[report.DistanceError, ...]:
     """Return the known distances of the survey, measured between the intersections of their ends' marks."""
-    known = solved.survey.distances
-    rays = mark_rays([end for distance in known for end in distance.ends], solved.sparse)
-    place = triangulated_points(solved, rays)
-    rejected = {row.name for row in solved.model.measurements if row.kind == "distance" and not row.used}
+    known, solution = survey.distances, posterior.solution
+    rays = mark_rays([end for distance in known for end in distance.ends], posterior.sparse)
+    place = triangulated_points(solution, rays)
+    rejected = {row.name for row in solution.measurements if row.kind == "distance" and not row.used}
     length_m, sigma_m = np.linalg.norm(place[::2] - place[1::2], axis=1), np.full(len(known), np.nan)
     if (whole := np.isfinite(length_m)).any():
         ends = np.repeat(whole, 2)
@@ -290,13 +288,13 @@ _SINGULAR = 1e-12  # of the largest variance: directions of smaller variance are
 
 
 def cautions_of_prediction(
-    solved: SolvedSurvey, posterior: Posterior, triangulated: report.CheckPointErrors, *, of_initial: bool
+    survey: Survey, posterior: Posterior, triangulated: report.CheckPointErrors, *, of_initial: bool
 ) -> tuple[Remark, ...]:
     """Return the limits of the predicted accuracy; `of_initial`: the points have the initial similarity."""
     if of_initial:
         sentence = "The points are measured with the initial similarity; the predicted σ are of the adjusted one."
         return (Remark(code="prediction-of-adjusted-similarity", sentence=sentence),)
-    joint = jointly_checked(solved, posterior)
+    joint = jointly_checked(survey, posterior)
     if joint is None:
         return ()
     found = find_blunders(joint.error_in_geo, joint.cov)
@@ -333,7 +331,8 @@ def chi2_caution(
         return Remark(
             code="prediction-pessimistic",
             sentence=f"The predicted σ are too large: {figures}. The σ of prediction, marks and check points "
-            f"together are {ratio**-0.5:.1f} times the errors. State smaller σ, such as --sigma-mark.",
+            f"together are {ratio**-0.5:.1f} times the errors.",
+            remedy="State smaller σ, such as --sigma-mark.",
         )
     others = tuple(name for name in names if name not in blunders)
     good = np.repeat([name not in blunders for name in names], 3)

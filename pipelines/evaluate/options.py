@@ -12,7 +12,22 @@ from pipelines.survey.report_parts import Alignment
 
 
 class EvaluateOptions(FilledAreaOptions):
-    """Options of the evaluation with test views and check points."""
+    """Options of the evaluation with test views and check points.
+
+    Without training, the cameras of init-sim3 are evaluated alone. Check points are triangulated (their marks
+    intersected) and measured on the rendered surface (the depth of the Gaussians at the marks, not their
+    centres), and stated as the ASPRS standard asks. The predicted accuracy over the scene is drawn in
+    evaluate/accuracy.png. A survey without check points has --cross-validate: every control point measured by a
+    solution that does not know it. The report is evaluate/report.json; evaluate/points.csv has the error of every
+    point, and --points prints them.
+
+    Examples:
+      georef evaluate flight
+      georef evaluate flight --renders 2 --json
+      georef evaluate flight --points --crs EPSG:32632
+      georef evaluate flight --cross-validate
+      georef evaluate flight --reference scan.laz --reference-sigma 0.02
+    """
 
     backend: Backend = Field("auto", description="Rasteriser.")
     renders: int = Field(8, ge=0, description="Largest number of side-by-side renders to write.")

@@ -34,9 +34,9 @@ class TrainingCoverage:
 
     def __init__(self, renderer: ModelRenderer) -> None:
         self._renderer = renderer
-        points = renderer.trained.point_in_model
+        points = renderer.model.point_in_model(renderer.sfm)
         self._surface = PointSurface(points) if len(points) else None
-        self._train = renderer.trained.indices("train")
+        self._train = renderer.model.indices("train")
 
     def covered(self, index: int) -> Tensor | None:
         """Return the mask (H, W) of the pixels of a view whose ground at least two training views show.
@@ -64,7 +64,7 @@ class TrainingCoverage:
 # Saves, for a test view, RGB: the photograph, its render, their difference, side by side with labels.
 SaveRender = Callable[[str, ByteArray], None]
 
-_NO_WEIGHTS = "no weights were given: they are not part of the package (--lpips-weights FILE.npz)"
+_NO_WEIGHTS = "no weights were given: they are not part of the package"
 
 
 def compare_test_views(
@@ -86,12 +86,12 @@ def compare_test_views(
     Raises:
         InputError: a photograph or the weights cannot be read.
     """
-    indices, views = renderer.trained.indices("test"), []
+    indices, views = renderer.model.indices("test"), []
     coverage = TrainingCoverage(renderer)
     distance = None if lpips_weights is None else Lpips(lpips_weights)
     with progress.task("test views", len(indices)) as task:
         for place, index in enumerate(indices):
-            name = renderer.trained.sparse.image_name[index]
+            name = renderer.sparse.image_name[index]
             seen = renderer.render(index)
             render = through_lens(renderer, index, seen.colour.cpu()).clamp(0, 1)
             over_white = seen.colour + (1 - seen.alpha)[..., None] * _to_white(renderer)
@@ -124,7 +124,7 @@ def compare_test_views(
 
 def _to_white(renderer: ModelRenderer) -> Tensor:
     """Return what a render (…, 3) over the model's background lacks where nothing lies, to be one over white."""
-    background = torch.tensor(renderer.trained.model.background, dtype=torch.float32)
+    background = torch.tensor(renderer.model.background, dtype=torch.float32)
     return (1 - background).to(renderer.device)
 
 

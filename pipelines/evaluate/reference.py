@@ -29,7 +29,7 @@ from pipelines.evaluate.reference_distances import (
     CorePoints,
     DistanceTally,
     compare_square,
-    level_of_detection,
+    m3c2_level_of_detection,
 )
 from pipelines.geodesy.enu import Origin
 from pipelines.geometry.footprints import first_of_voxels
@@ -41,8 +41,9 @@ from pipelines.surface.measured_cloud import CloudReader, MeasuredCloud, Thinnin
 from pipelines.surface.registration import fit_alignment
 from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
 from pipelines.surface.visibility import Viewpoints, seen_surface
+from pipelines.survey.area import scene_points
 from pipelines.survey.report_parts import ReferenceComparison, ReferenceShift
-from pipelines.survey.trained_survey import TrainedSurvey, scene_points
+from pipelines.survey.solution import Solution
 
 _SQUARE_M = 32.0  # two million points of the reference at the most, in voxels of 0.025 m
 _OVERVIEW_M, _MOST_OVERVIEW = 0.25, 10_000_000
@@ -62,6 +63,7 @@ class ComparedReference:
 
 def compare_with_reference(
     renderer: ModelRenderer,
+    origin: Origin,
     files: CloudReader,
     grid: AccuracyGrid | None,
     options: EvaluateOptions,
@@ -69,7 +71,7 @@ def compare_with_reference(
     scratch: Path,
     progress: Progress,
 ) -> ComparedReference:
-    """Return the comparison of a trained survey with a reference.
+    """Return the comparison of the surface of a survey from an `origin` with a reference.
 
     Without `grid`, the σ of the georeference is not known. The folder `scratch` holds depth maps and sorted points,
     and is removed at the end.
@@ -79,15 +81,14 @@ def compare_with_reference(
         DegenerateGeometryError: the views agree on no point of a surface, or nothing tells how to move the model.
     """
     assert options.reference is not None  # the caller opened its files
-    trained = renderer.trained
-    points = scene_points(trained)
+    points = scene_points(renderer.model, renderer.sfm)
     margin = np.array([_MARGIN_M, _MARGIN_M, _MARGIN_UP_M])  # a reference may lie above or below the scene
     box = points.min(axis=0) - margin, points.max(axis=0) + margin
     thinning = Thinning(_OVERVIEW_M, _MOST_OVERVIEW, *box)
-    overview = read_thinned(files, trained.survey.origin_on_earth, thinning, progress)
+    overview = read_thinned(files, origin, thinning, progress)
     model, fusion, shift, moved = _model(renderer, overview, options, scratch, progress)
     seen = seen_surface(_viewpoints(renderer, moved), overview.position_in_geo, overview.voxel_m, progress)
-    reference = _sorted_reference(files, trained.survey.origin_on_earth, box, scratch / "reference", progress)
+    reference = _sorted_reference(files, origin, box, scratch / "reference", progress)
     spacing_m = spacing_of(reference, min(THRESHOLDS_M) / 2)
     settings = ComparisonSettings.of_spacings(spacing_m, fusion.spacing_m, min(THRESHOLDS_M), box)
     tally, squares = DistanceTally(), sorted({*reference.count, *model.count})
@@ -96,9 +97,9 @@ def compare_with_reference(
             tally.add(compare_square(square, reference, model, seen, settings))
             task.advance()
     cores = tally.cores()
-    sigma_m = _georeference_sigma(cores.position, cores.normal, trained, grid)
+    sigma_m = _georeference_sigma(cores.position, cores.normal, renderer.model, grid)
     known = np.zeros(len(cores.position)) if sigma_m is None or moved is not None else sigma_m
-    lod_m = level_of_detection(cores.noise_m, np.hypot(known, options.reference_sigma))
+    lod_m = m3c2_level_of_detection(cores.noise_m, np.hypot(known, options.reference_sigma))
     comparison = ReferenceComparison(
         name=options.reference.name,
         crs=files.crs_names,
@@ -122,7 +123,7 @@ def _model(
     renderer: ModelRenderer, overview: MeasuredCloud, options: EvaluateOptions, scratch: Path, progress: Progress
 ) -> tuple[TiledPoints, FusionSettings, ReferenceShift | None, Similarity | None]:
     """Return the model's cloud, its shift against the reference, and any similarity by which it was moved."""
-    geo_from_model = renderer.trained.geo_from_model
+    geo_from_model = renderer.geo_from_model
     views = SurfaceViews(renderer, scratch / "depth_maps", colours=True, confirmed=True, progress=progress)
     settings = fusion_settings(views, geo_from_model, _LEAST_VIEWS)
     delivered = TiledPoints(scratch / "delivered", _SQUARE_M)
@@ -144,7 +145,8 @@ def _model(
         raise DegenerateGeometryError(
             "reference-not-aligned",
             "The surface and the reference overlap too little, or their shape leaves an axis open, so that the "
-            f"{kind} between them cannot be estimated. Compare with --reference-align none.",
+            f"{kind} between them cannot be estimated.",
+            remedy="Compare with --reference-align none.",
         )
     similarity, shift = found
     moved = TiledPoints(scratch / "moved", delivered.side_m)
@@ -156,9 +158,8 @@ def _model(
 
 def _viewpoints(renderer: ModelRenderer, moved: Similarity | None) -> Viewpoints:
     """Return the training cameras in geo, moved as the model's cloud was."""
-    trained = renderer.trained
-    cameras, poses = trained.indices("train"), trained.poses
-    similarity = trained.geo_from_model if moved is None else moved @ trained.geo_from_model
+    cameras, poses = renderer.model.indices("train"), renderer.poses
+    similarity = renderer.geo_from_model if moved is None else moved @ renderer.geo_from_model
     return Viewpoints(
         poses.cam_from_model[cameras] @ similarity.rotation.T,
         similarity.apply(poses.cam_center_in_model[cameras]),
@@ -178,10 +179,10 @@ def _sorted_reference(
 
 
 def _georeference_sigma(
-    position: FloatArray, normal: FloatArray, trained: TrainedSurvey, grid: AccuracyGrid | None
+    position: FloatArray, normal: FloatArray, solution: Solution, grid: AccuracyGrid | None
 ) -> FloatArray | None:
     """Return the predicted σ (C,) of the georeference along normals; None: not known."""
-    if grid is None or not len(position) or not is_checked(trained.model.cautions):
+    if grid is None or not len(position) or not is_checked(solution.cautions):
         return None
     return np.asarray(np.sqrt(np.einsum("ci,cij,cj->c", normal, grid.cov_at(position), normal)))
 
@@ -191,6 +192,7 @@ _SEEN = 0.05
 
 
 def cautions_of_reference(found: ComparedReference) -> tuple[Remark, ...]:
+    """Return the limits of a comparison: assumptions, coarse points, a shift of the whole, unseen places."""
     comparison = found.comparison
     cautions = list(found.assumptions)
     fine = max(comparison.spacing_m, comparison.model_spacing_m)
@@ -208,9 +210,10 @@ def cautions_of_reference(found: ComparedReference) -> tuple[Remark, ...]:
             off = (
                 "The model is shifted against the reference by more than three times the σ of both: the best fit "
                 f"moves it by {shift.enu_m[0]:+.3f} m east, {shift.enu_m[1]:+.3f} m north and "
-                f"{shift.enu_m[2]:+.3f} m up. To compare the shape alone, use --reference-align shift."
+                f"{shift.enu_m[2]:+.3f} m up."
             )
-            cautions.append(Remark(code="reference-shifted", sentence=off))
+            remedy = "To compare the shape alone, use --reference-align shift."
+            cautions.append(Remark(code="reference-shifted", sentence=off, remedy=remedy))
     if comparison.seen < _SEEN:
         seen = f"Photographs saw {100 * comparison.seen:.1f} % of the reference's points within the scene."
         cautions.append(Remark(code="reference-unseen", sentence=seen))

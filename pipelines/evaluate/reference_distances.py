@@ -98,6 +98,7 @@ def compare_square(
     seen: SeenSurface,
     settings: ComparisonSettings,
 ) -> SquareDistances:
+    """Return the distances between both clouds in a square of the plan; points around it are neighbours only."""
     margin_m = FARTHEST_M + 3 * settings.core_m
     rows, own = reference.around(square, margin_m)
     every = at_random(rows["position"])
@@ -259,7 +260,7 @@ def m3c2_figures(distance_m: FloatArray, lod_m: FloatArray) -> M3c2Figures:
     )
 
 
-def level_of_detection(noise_m: FloatArray, registration_m: FloatArray) -> FloatArray:
+def m3c2_level_of_detection(noise_m: FloatArray, registration_m: FloatArray) -> FloatArray:
     """Return the level of detection, 95 %, of distances with σ of noise and of the clouds' places, both (C,)."""
     return CONFIDENCE_95 * (noise_m + registration_m)
 

@@ -23,7 +23,7 @@ from pipelines.core.figures import WAYS, Headline, ToleranceTest
 from pipelines.core.products import Remark, is_checked, save_json, union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.sentences import listed
-from pipelines.core.stages import BY_NAME
+from pipelines.core.stages import BY_NAME, HELD_OUT
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.evaluate import check_points
@@ -35,6 +35,7 @@ from pipelines.evaluate.coordinates import (
     write_camera_sigma,
     write_point_table,
 )
+from pipelines.evaluate.held_out import held_out_depths
 from pipelines.evaluate.options import EvaluateOptions
 from pipelines.evaluate.photometric import compare_test_views
 from pipelines.evaluate.reference import (
@@ -46,16 +47,18 @@ from pipelines.evaluate.reference import (
 from pipelines.evaluate.surface_heights import surface_accuracy, surface_heights
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import lla_from_enu
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.report.place import map_coordinates
 from pipelines.report.plots.maps import MapPoints, SigmaRaster, write_accuracy_map
 from pipelines.report.plots.plans import MapCoordinates, NamedPlaces
-from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.m3c2 import require_py4dgeo
 from pipelines.surface.measured_area import area_of
 from pipelines.surface.measured_cloud import CloudReader
-from pipelines.surface.surface_views import ModelRenderer
+from pipelines.surface.surface_views import ModelRenderer, model_renderer
 from pipelines.survey.area import Area
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline
+from pipelines.survey.held_out import HeldOutPoints
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
 from pipelines.survey.options import CloudCrs, CrsOptions
 from pipelines.survey.photographs import write_render
@@ -71,10 +74,10 @@ from pipelines.survey.report import (
     SimilaritySigma,
     SurfaceHeight,
 )
-from pipelines.survey.scene import photographs
+from pipelines.survey.report_parts import HeldOutDepths
+from pipelines.survey.solution import Solution, TrainedModel, read_sfm, read_solution
 from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.target_crs import TargetCrs, usable_crs
-from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_solved
 
 
 def summarise(report: EvaluationReport) -> Summary:
@@ -89,6 +92,8 @@ def summarise(report: EvaluationReport) -> Summary:
         values |= {f"{way}_{name}": getattr(errors, name) for name in figures}
     if report.distances:
         values["distances"] = [distance.model_dump() for distance in report.distances]
+    if report.held_out is not None:
+        values["held_out"] = report.held_out.model_dump()
     if report.tolerances:
         values["tolerances"] = [each.model_dump() for each in report.tolerances]
     key_figure = f"{report.headline.sentence}; {_test_views(test)}"
@@ -125,15 +130,19 @@ def _warnings(report: EvaluationReport) -> tuple[Remark, ...]:
 
 
 def draw_accuracy(
-    grid: AccuracyGrid, solved: SolvedSurvey, report: EvaluationReport, crs: PointCrs | None, path: Path
+    grid: AccuracyGrid,
+    survey: Survey,
+    report: EvaluationReport,
+    path: Path,
+    *,
+    center: FloatArray,
+    crs: PointCrs | None,
 ) -> None:
     """Write a map of the predicted accuracy, with cameras, control and check points, errors and coordinates.
 
-    The coordinates are in a CRS; None: in the UTM zone.
+    The cameras (N, 3) are in `geo`, the coordinates in a CRS; None: in the UTM zone.
     """
-    survey = solved.survey
     raster = SigmaRaster(grid.raster(grid.sigma_h_m), grid.raster(grid.sigma_v_m), grid.corner_in_geo, grid.size_m)
-    center = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
     points = MapPoints(
         cameras=center[:, :2],
         control=_named(survey.control_points, report.fit.gcp.points),
@@ -156,12 +165,16 @@ def _coordinates(survey: Survey, crs: PointCrs | None, center: FloatArray) -> Ma
 
 @dataclass(frozen=True)
 class Rendered:
-    """What the Gaussians of a trained model show: test views, check points on the surface, and any reference."""
+    """What the Gaussians of a trained model show: test views, check points on the surface, and any reference.
+
+    `held_out`: errors at measured points that the training was not given; None: there are none.
+    """
 
     photometric: Photometric
     points: CheckPointErrors
     heights: tuple[SurfaceHeight, ...]
     reference: ComparedReference | None
+    held_out: HeldOutDepths | None = None
 
 
 def run(stage: StageRun, options: EvaluateOptions) -> Summary:
@@ -172,44 +185,57 @@ def run(stage: StageRun, options: EvaluateOptions) -> Summary:
         InputError: `--reference` or `--lpips-weights` without a trained model.
         GeorefError: a product, a photograph or the LPIPS weights cannot be read, or the CRS cannot be used.
     """
-    solved = load_solved(stage.workspace, options.similarity)
-    crs = None if options.crs is None else report_crs(options.crs, solved.survey)
-    posterior = posterior_of(stage.workspace, solved.model, solved.sfm)
-    area = area_of_interest(options, solved, stage.workspace, stage.progress)
-    if isinstance(solved, TrainedSurvey):
-        rendered = _rendered(stage, solved, posterior, options, area)
+    solution = read_solution(stage.workspace, similarity=options.similarity)
+    sfm, survey = read_sfm(stage.workspace, solution), solution.weighted(load_survey(stage.workspace))
+    crs = None if options.crs is None else report_crs(options.crs, survey)
+    posterior = posterior_of(stage.workspace, solution, sfm)
+    area = area_of_interest(options, stage.workspace, solution, sfm, survey, progress=stage.progress)
+    if isinstance(solution, TrainedModel):
+        files = _reference_reader(options)
+        renderer = model_renderer(
+            stage.workspace, solution, sfm, survey, backend=options.backend, progress=stage.progress
+        )
+        rendered = _rendered(stage, renderer, survey, posterior, options, files=files, area=area)
     else:
         rendered = None
         for flag, value in (("--reference", options.reference), ("--lpips-weights", options.lpips_weights)):
             if value is not None:
                 command = stage.workspace.command_of(BY_NAME["train"])
-                message = f"needs a trained model. Run `{command}` first, or leave the option out."
-                raise InputError("not-trained", message, field=flag)
-    report = evaluate(solved, posterior, options, crs=crs, rendered=rendered, area=area)
+                message = "needs a trained model."
+                remedy = f"Run `{command}` first, or leave the option out."
+                raise InputError("not-trained", message, field=flag, remedy=remedy)
+    report = evaluate(survey, posterior, options, crs=crs, rendered=rendered, area=area)
     if posterior.grid is not None:
-        write_csv(posterior.grid, solved.survey.origin, stage.out / "accuracy.csv")
-        draw_accuracy(posterior.grid, solved, report, crs, stage.out / "accuracy.png")
-    write_point_table(stage.out / "points.csv", report, solved.survey)
+        write_csv(posterior.grid, survey.origin, stage.out / "accuracy.csv")
+        path, center = stage.out / "accuracy.png", solution.center_in_geo
+        draw_accuracy(posterior.grid, survey, report, path, center=center, crs=crs)
+    write_point_table(stage.out / "points.csv", report, survey)
     if report.cameras is not None:
-        write_camera_sigma(stage.out / "cameras.csv", solved.sfm.image_name, posterior.camera_cov)
+        write_camera_sigma(stage.out / "cameras.csv", sfm.image_name, posterior.camera_cov)
     save_json(report, stage.out / "report.json")
     summary = summarise(report)
-    wrong = of_wrong_marks(wrong_marks(solved.survey.check_points, solved.sparse))
+    wrong = of_wrong_marks(wrong_marks(survey.check_points, posterior.sparse))
     return replace(summary, warnings=(*summary.warnings, *wrong))
 
 
 def area_of_interest(
-    options: EvaluateOptions, solved: SolvedSurvey, workspace: Workspace, progress: Progress = SILENT
+    options: EvaluateOptions,
+    workspace: Workspace,
+    solution: Solution,
+    sfm: SparseModel,
+    survey: Survey,
+    *,
+    progress: Progress = SILENT,
 ) -> Area | None:
     """Return the area of interest, as `area_of`; None: no ground is seen by enough photographs."""
     try:
-        return area_of(options, solved, workspace, progress)
+        return area_of(options, workspace, solution, sfm, survey, progress=progress)
     except DegenerateGeometryError:
         return None
 
 
 def evaluate(
-    solved: SolvedSurvey,
+    survey: Survey,
     posterior: Posterior,
     options: EvaluateOptions,
     *,
@@ -217,20 +243,20 @@ def evaluate(
     rendered: Rendered | None = None,
     area: Area | None = None,
 ) -> EvaluationReport:
-    """Return the report on a solved survey; `crs` lists the check points, without `rendered` nothing is trained.
+    """Return the report on a survey; `crs` lists the check points, without `rendered` nothing is trained.
 
     Raises:
         InputError: a point lies outside the CRS's domain.
     """
-    model = solved.model
+    model = posterior.solution
     log_scale, *_, east, north, up = np.sqrt(np.maximum(np.diag(model.geo_from_model.covariance), 0.0)).tolist()
     area_km2 = None if area is None else area.hectares / 100
-    triangulated = check_points.triangulated_check_points(solved, posterior, area_km2)
+    triangulated = check_points.triangulated_check_points(survey, posterior, area_km2)
     heights = () if rendered is None else rendered.heights
     checkpoints = CheckPoints(
         triangulated=triangulated, surface=None if rendered is None else rendered.points, heights=heights
     )
-    surface = surface_accuracy(heights, solved.survey.check_points)
+    surface = surface_accuracy(heights, survey.check_points)
     scene = model.accuracy or AccuracySummary(cells=0, reason="the adjustment states no σ")
     reference = None if rendered is None else rendered.reference
     accuracy = headline(triangulated, scene, model.cautions, surface)
@@ -240,22 +266,25 @@ def evaluate(
         area_measured=None if area is None else area.measured,
         photometric=None if rendered is None else rendered.photometric,
         checkpoints=checkpoints,
-        cross_validation=check_points.cross_validate(solved) if options.cross_validate else None,
+        cross_validation=check_points.cross_validate(survey, posterior) if options.cross_validate else None,
         accuracy=scene,
-        fit=Fit(gnss=check_points.fix_residuals(solved), gcp=check_points.control_residuals(solved)),
+        fit=Fit(
+            gnss=check_points.fix_residuals(survey, model), gcp=check_points.control_residuals(survey, posterior)
+        ),
         cameras=check_points.rms_sigma(posterior.camera_cov[:, 3:, 3:]) if is_checked(model.cautions) else None,
         similarity=SimilaritySigma(sigma_ln_scale=log_scale, sigma_translation_m=(east, north, up)),
-        coordinates=None if crs is None else coordinates_in(crs, checkpoints, solved.survey),
+        coordinates=None if crs is None else coordinates_in(crs, checkpoints, survey),
         reference=None if reference is None else reference.comparison,
-        distances=check_points.distance_errors(solved, posterior),
+        held_out=None if rendered is None else rendered.held_out,
+        distances=check_points.distance_errors(survey, posterior),
         tolerances=_tolerances(accuracy, options, area_km2),
         variance_factors=model.variance_factors,
         cautions=union(
             model.cautions,
             check_points.cautions_of_prediction(
-                solved, posterior, triangulated, of_initial=options.similarity == "initial"
+                survey, posterior, triangulated, of_initial=options.similarity == "initial"
             ),
-            check_points.dependent_check_points(solved.survey),
+            check_points.dependent_check_points(survey),
             () if reference is None else cautions_of_reference(reference),
         ),
     )
@@ -278,31 +307,46 @@ def _tolerances(accuracy: Headline, options: EvaluateOptions, area_km2: float | 
     )
 
 
+def _reference_reader(options: EvaluateOptions) -> CloudReader | None:
+    """Return the reader of the reference, refused before work starts: without a CRS, or without the library."""
+    if options.reference is None:
+        return None
+    require_py4dgeo()
+    stated = CloudCrs(options.reference_crs, options.reference_vertical, "--reference", options.reference_offset)
+    return CloudReader(options.reference, stated)
+
+
 def _rendered(
-    stage: StageRun, trained: TrainedSurvey, posterior: Posterior, options: EvaluateOptions, area: Area | None
+    stage: StageRun,
+    renderer: ModelRenderer,
+    survey: Survey,
+    posterior: Posterior,
+    options: EvaluateOptions,
+    *,
+    files: CloudReader | None,
+    area: Area | None,
 ) -> Rendered:
-    files, progress = None, stage.progress
-    if options.reference is not None:  # refused before work starts: a file without a CRS, and a missing library
-        require_py4dgeo()
-        stated = CloudCrs(
-            options.reference_crs, options.reference_vertical, "--reference", options.reference_offset
-        )
-        files = CloudReader(options.reference, stated)
-    images = photographs(trained.sfm, trained.survey, stage.workspace, trained.model.max_image_size)
-    images.build(progress)
-    renderer = ModelRenderer(
-        trained, images, rasterizer(options.backend, progress, mip_filter=trained.model.mip_filter)
-    )
+    progress = stage.progress
+    renderer.images.build(progress)
     renders, reference = stage.out / "renders", None
     renders.mkdir(parents=True, exist_ok=True)
     if files is not None:
         scratch = stage.out / "reference"
         reference = compare_with_reference(
-            renderer, files, posterior.grid, options, scratch=scratch, progress=progress
+            renderer, survey.origin_on_earth, files, posterior.grid, options, scratch=scratch, progress=progress
         )
         draw_reference(reference, stage.out)
     area_km2 = None if area is None else area.hectares / 100
-    points = check_points.check_points_on_surface(renderer, progress, area_km2)
+    points = check_points.check_points_on_surface(survey.check_points, renderer, progress, area_km2)
     save_render = partial(write_render, renders)
     test = compare_test_views(renderer, options.lpips_weights, save_render, progress, saved=options.renders)
-    return Rendered(Photometric(test=test), points, surface_heights(renderer, progress), reference)
+    held_out = None
+    if stage.workspace.has(HELD_OUT):
+        held_out = held_out_depths(renderer, HeldOutPoints.load(stage.workspace.path(HELD_OUT)), progress)
+    return Rendered(
+        Photometric(test=test),
+        points,
+        surface_heights(survey.check_points, renderer, progress),
+        reference,
+        held_out,
+    )

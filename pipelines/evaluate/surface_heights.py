@@ -19,7 +19,6 @@ from pipelines.surface.plan_heights import heights_in_plan
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.report import SurfaceHeight
 from pipelines.survey.survey import SurveyedPoint
-from pipelines.survey.trained_survey import TrainedSurvey
 
 _RAISED_M = 1.0  # above the ground, from which a check point lies on a roof, a wall or a vehicle
 _STEP_M = 1.0  # of the surface around a point, from which it lies at an edge, and of the surface above a point
@@ -28,18 +27,19 @@ _REACH_PX = 1.5  # of a place: the pixels whose mean height it takes
 _NEIGHBOURS, _LEAST_SPACING_M, _LEAST_POINTS = 10, 0.5, 100  # of the tie points that show the ground
 
 
-def surface_heights(renderer: ModelRenderer, progress: Progress) -> tuple[SurfaceHeight, ...]:
+def surface_heights(
+    check_points: Sequence[SurveyedPoint], renderer: ModelRenderer, progress: Progress
+) -> tuple[SurfaceHeight, ...]:
     """Return the rendered surface's height above each check point's, in plan at the surveyed place.
 
     Left out are points under vegetation, where the surface is that of the plants. Points at an edge, as on a wall,
     and points that a surface covers, as below a roof, are no places of a DSM: their difference is not stated.
     """
-    trained = renderer.trained
-    points = [point for point in trained.survey.check_points if point.land_cover != "vegetated"]
+    points = [point for point in check_points if point.land_cover != "vegetated"]
     if not points:
         return ()
     surveyed = np.array([point.position_in_geo for point in points])
-    center = trained.geo_from_model.apply(trained.poses.cam_center_in_model)
+    center = renderer.model.center_in_geo
     arm_m = np.linalg.norm(center[None] - surveyed[:, None], axis=2)
     focal_px = np.array([renderer.pinholes.of(camera).fx for camera in range(len(center))])
     pixel_m = float(np.median((arm_m / focal_px).min(axis=1)))  # of the most detailed view
@@ -53,7 +53,8 @@ def surface_heights(renderer: ModelRenderer, progress: Progress) -> tuple[Surfac
     difference = height[:, 0] - surveyed[:, 2]
     at_edge = np.ptp(np.where(np.isfinite(height), height, height[:, :1]), axis=1) > _STEP_M
     covered = difference > _STEP_M
-    raised = _raised(trained, surveyed)
+    tie_points = renderer.geo_from_model.apply(renderer.model.point_in_model(renderer.sfm))
+    raised = _raised(tie_points, surveyed)
     rows = []
     for index, point in enumerate(points):
         place = None if raised is None else "raised" if raised[index] else "ground"
@@ -84,12 +85,11 @@ def surface_accuracy(heights: Sequence[SurfaceHeight], points: Sequence[Surveyed
     return found if found.parts else None
 
 
-def _raised(trained: TrainedSurvey, surveyed: FloatArray) -> BoolArray | None:
+def _raised(points: FloatArray, surveyed: FloatArray) -> BoolArray | None:
     """Return which places (J, 3) stand above the ground around them; None: the ground is not known.
 
-    The ground is found in the tie points: no Gaussian below it can pull it down.
+    The ground is found in the tie points (N, 3): no Gaussian below it can pull it down.
     """
-    points = trained.geo_from_model.apply(trained.point_in_model)
     if extra_part("terrain").found is None or len(points) < _LEAST_POINTS:
         return None
     distance, near = cKDTree(points).query(points, k=_NEIGHBOURS)

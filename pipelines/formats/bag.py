@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from pipelines.core.errors import InputError
 from pipelines.core.extras import require
 from pipelines.core.types import ByteArray
-from pipelines.formats.bag_files import BagFiles, counts_of, has_data_files, open_files
-from pipelines.formats.bag_limits import DEFINITIONS, refuse_large_chunk, unpacked
+from pipelines.formats.bag_files import BagFiles, has_data_files, message_counts, open_files
+from pipelines.formats.bag_limits import refuse_large_chunk, unpacked
 from pipelines.formats.image_file import MAX_BYTES, MAX_PIXELS, header_size
+from pipelines.formats.px4_messages import DEFINITIONS
 
 # Schemas of mcap that do not belong in a ROS bag; the reader cannot open a bag with them. ROS 1's do not belong
 # beside messages in CDR.
@@ -74,7 +75,7 @@ class Bag:
         self.fallback_types: set[str] = set()  # decoded by a definition that the bag itself does not have
         # Topics that metadata.yaml counts messages of, and that no data file has any of
         self.lost: dict[str, BagTopic] = {}
-        counts = counts_of(self._storages)
+        counts = message_counts(self._storages)
         self.topics = {
             name: BagTopic(name, kind, count) for (name, kind), count in sorted(counts.items(), reverse=True)
         }
@@ -202,8 +203,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
     if not path.exists():
         raise InputError("bag-missing", "The bag does not exist.", path=path, field="--bag")
     if path.is_dir() and not (path / "metadata.yaml").exists() and not has_data_files(path):
-        message = "The folder has no metadata.yaml and no .mcap or .db3 files: give the folder of a bag."
-        raise InputError("bag-metadata-missing", message, path=path, field="--bag")
+        message = "The folder has no metadata.yaml and no .mcap or .db3 files."
+        remedy = "Give the folder of a bag."
+        raise InputError("bag-metadata-missing", message, path=path, field="--bag", remedy=remedy)
     if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
         message = "The file is not a bag: give a rosbag2 folder, or a .mcap, .db3 or .bag file."
         raise InputError("not-a-bag", message, path=path, field="--bag")

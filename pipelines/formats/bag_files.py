@@ -163,10 +163,9 @@ def _data_files(folder: Path, metadata: _Metadata, notes: list[Remark]) -> tuple
     others = list({_unpacked_name(file): file for file in reversed(others)}.values())[::-1]
     if not others and (lost or not listed):
         what = f"{', '.join(lost[:_SHOWN])}, which metadata.yaml lists" if lost else "its data files"
-        message = (
-            f"The folder lacks {what}: copy the bag again, or write its metadata anew with `ros2 bag reindex`."
-        )
-        raise InputError("bag-file-missing", message, path=folder, field="--bag")
+        message = f"The folder lacks {what}."
+        remedy = "Copy the bag again, or write its metadata anew with `ros2 bag reindex`."
+        raise InputError("bag-file-missing", message, path=folder, field="--bag", remedy=remedy)
     if lost:
         names = ", ".join(lost[:_SHOWN])
         sentence = f"The bag lacks {names}, which metadata.yaml lists: their messages are missing unless renamed."
@@ -216,10 +215,11 @@ def _settled(file: Path, room: Path, notes: list[Remark]) -> Path:
     size = file.stat().st_size + sum(log.stat().st_size for log in logs)
     if shutil.disk_usage(room).free < size:
         message = (
-            f"{names} has messages that are not in {file.name} yet, and {room.parent} has no room for a copy of "
-            f'both. Write them into the database: sqlite3 {file.name} "PRAGMA wal_checkpoint(TRUNCATE)".'
+            f"{names} has messages that are not in {file.name} yet, and {room.parent} has no room for a copy "
+            "of both."
         )
-        raise InputError("bag-write-ahead-log", message, path=file, field="--bag")
+        remedy = f'Write them into the database: sqlite3 {file.name} "PRAGMA wal_checkpoint(TRUNCATE)".'
+        raise InputError("bag-write-ahead-log", message, path=file, field="--bag", remedy=remedy)
     copy = room / file.name
     for source in (file, *logs):
         shutil.copyfile(source, room / source.name)
@@ -327,7 +327,7 @@ def _add_unlisted(bag: BagFiles, file: Path, storage: Any) -> None:
         bag.notes.append(Remark(code="bag-file-not-listed", sentence=sentence))
 
 
-def counts_of(storages: list[Any]) -> dict[tuple[str, str], int]:
+def message_counts(storages: list[Any]) -> dict[tuple[str, str], int]:
     """Return the number of messages by topic and type, as the data files state them."""
     counts: dict[tuple[str, str], int] = {}
     for link in (link for storage in storages for link in storage.connections):
@@ -338,7 +338,7 @@ def counts_of(storages: list[Any]) -> dict[tuple[str, str], int]:
 def _note_differences(bag: BagFiles, metadata: _Metadata, storages: set[str]) -> None:
     """Note what `metadata.yaml` states otherwise than the data files."""
     held: dict[str, int] = {}
-    for (topic, _), count in counts_of(bag.storages).items():
+    for (topic, _), count in message_counts(bag.storages).items():
         held[topic] = held.get(topic, 0) + count
     parts = []
     if storages and {metadata.storage} != storages:

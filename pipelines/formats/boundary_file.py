@@ -135,14 +135,16 @@ def read_boundary(path: Path, *, field: str) -> Boundary:
     if not found:
         count = sum(len(layer.shapes) for layer in layers)
         raise refusal(
-            "boundary-without-area", f"has {count} shapes, and none is a polygon. Draw the boundary as one."
+            "boundary-without-area",
+            f"has {count} shapes, and none is a polygon.",
+            remedy="Draw the boundary as one.",
         )
     return Boundary(tuple(found), unit, suffix == ".dxf", remarks)
 
 
 def _no_boundary(refusal: _Refusal) -> InputError:
     kinds = "GeoJSON (.geojson), GeoPackage (.gpkg), KML (.kml, .kmz) or DXF (.dxf)"
-    return refusal("boundary-format", f"is no boundary file that is known. Give {kinds}.")
+    return refusal("boundary-format", "is no boundary file that is known.", remedy=f"Give {kinds}.")
 
 
 def _unzipped(data: bytes, refusal: _Refusal) -> bytes:
@@ -152,15 +154,18 @@ def _unzipped(data: bytes, refusal: _Refusal) -> bytes:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             name = next((name for name in archive.namelist() if name.lower().endswith(".kml")), None)
             if name is None:
-                raise unreadable("is a KMZ without a KML inside. Export it again.")
+                raise unreadable("is a KMZ without a KML inside.", remedy="Export it again.")
             with archive.open(name) as file:
                 document = file.read(_MOST_BYTES + 1)
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, zlib.error) as error:
-        message = f"cannot be unpacked as KMZ: {type(error).__name__} {str(error)[:100]}. Export it again, as KML."
-        raise unreadable(message) from error
+        message = f"cannot be unpacked as KMZ: {type(error).__name__} {str(error)[:100]}."
+        remedy = "Export it again, as KML."
+        raise unreadable(message, remedy=remedy) from error
     if len(document) > _MOST_BYTES:
         raise refusal(
-            "file-too-large", f"unpacks to more than {_MOST_BYTES >> 20} MiB of KML. Draw the boundary alone."
+            "file-too-large",
+            f"unpacks to more than {_MOST_BYTES >> 20} MiB of KML.",
+            remedy="Draw the boundary alone.",
         )
     return document
 
@@ -177,7 +182,7 @@ def _as_utf8(data: bytes, refusal: _Refusal) -> bytes:
             return data.decode(name).lstrip("\ufeff").encode()
         except (UnicodeError, LookupError):
             continue
-    raise refusal("boundary-encoding", f"is no text in {names[0].upper()}. Save it as UTF-8.")
+    raise refusal("boundary-encoding", f"is no text in {names[0].upper()}.", remedy="Save it as UTF-8.")
 
 
 def _geojson(data: bytes, refusal: _Refusal) -> _Shapes:
@@ -197,13 +202,14 @@ def _geojson(data: bytes, refusal: _Refusal) -> _Shapes:
             else:
                 shapes += _geometry(item["type"], item["coordinates"])
     except (ValueError, TypeError, KeyError, IndexError, RecursionError, shapely.errors.ShapelyError) as error:
-        message = f"cannot be read as GeoJSON: {type(error).__name__} {str(error)[:100]}. Write it again."
-        raise unreadable(message) from error
+        message = f"cannot be read as GeoJSON: {type(error).__name__} {str(error)[:100]}."
+        remedy = "Write it again."
+        raise unreadable(message, remedy=remedy) from error
     if not own:
         return _Shapes("", shapes, _WGS84, crs_is_default=True)
     names = list(dict.fromkeys(_crs_member(member, refusal) for member in own))
     if len(names) > 1:
-        raise refusal("boundary-two-crs", f"names several CRSs: {', '.join(names)}. Give one of them.")
+        raise refusal("boundary-two-crs", f"names several CRSs: {', '.join(names)}.", remedy="Give one of them.")
     return _Shapes("", shapes, names[0])
 
 
@@ -238,7 +244,9 @@ def _crs_member(member: Any, refusal: _Refusal) -> str:
             return name
         if isinstance(code, int | str):
             return f"EPSG:{code}"
-    raise refusal("boundary-crs-member", "has a member `crs` without a name. Write the CRS as EPSG:n there.")
+    raise refusal(
+        "boundary-crs-member", "has a member `crs` without a name.", remedy="Write the CRS as EPSG:n there."
+    )
 
 
 def _gdal_layers(path: Path, *, is_drawing: bool, field: str) -> list[_Shapes]:
@@ -274,8 +282,11 @@ def _check_finite(layer: _Shapes, refusal: _Refusal) -> None:
             of_layer = f" of layer {layer.name}" if layer.name else ""
             raise refusal(
                 "boundary-not-finite",
-                f"has a corner that is no place: ({x:g}, {y:g}), corner {int(wrong[0]) + 1} of shape {number}"
-                f"{of_layer}. Write its coordinates as numbers.",
+                (
+                    f"has a corner that is no place: ({x:g}, {y:g}), corner {int(wrong[0]) + 1} of shape "
+                    f"{number}{of_layer}."
+                ),
+                remedy="Write its coordinates as numbers.",
             )
 
 

@@ -121,7 +121,7 @@ def check_precision(position: FloatArray, kind: type[np.floating[Any]], path: Pa
         step = np.spacing(kind(largest))
         message = f"Coordinates of {largest:.0f} m in single precision are rounded to {step:.3f} m."
         remedy = "Write the file with double coordinates, or LAZ."
-        raise InputError("single-precision", f"{message} {remedy}", path=path)
+        raise InputError("single-precision", message, path=path, remedy=remedy)
 
 
 def open_cloud_ply(path: Path) -> PlyCloudFile:
@@ -134,8 +134,9 @@ def open_cloud_ply(path: Path) -> PlyCloudFile:
     form = next((line[1] for line in lines if line[:1] == ["format"] and len(line) > 1), "")
     is_text = form == "ascii"
     if form not in _ORDERS and not is_text:
-        message = f"The format of the PLY is {form[:30]!r}: write it as binary_little_endian."
-        raise InputError("ply-format", message, path=path)
+        message = f"The format of the PLY is {form[:30]!r}."
+        remedy = "Write it as binary_little_endian."
+        raise InputError("ply-format", message, path=path, remedy=remedy)
     count, columns = _vertices(path, lines)
     kinds = [(name, "<f8" if is_text else _ORDERS[form] + kind) for name, kind in columns]
     dtype = np.dtype(kinds)
@@ -208,6 +209,7 @@ _POINT_VERTEX = [
 
 
 def set_columns(vertex: np.ndarray, names: Sequence[str], values: np.ndarray) -> None:
+    """Write the columns of an array (N, K) into the K named fields of N vertices."""
     for column, name in enumerate(names):
         vertex[name] = values[:, column]
 

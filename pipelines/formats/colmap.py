@@ -39,7 +39,6 @@ _INVALID_CAMERA = "has a camera model that is unknown"
 _INVALID_NAME = "has a name that is not UTF-8"
 # COLMAP logs a line for each step; only its errors are of use here.
 _COLMAP_ERRORS_ONLY = 2
-_INVALID_POINT = np.uint64(2**64 - 1)
 
 
 class RollingShutter(Product):
@@ -62,8 +61,9 @@ class _CutOffError(ValueError):
 def _check_model_files(folder: Path) -> None:
     """Refuse a COLMAP model, binary or text, whose files do not hold what they state."""
     if not folder.is_dir():
-        message = "The folder does not exist: give that of a COLMAP model (cameras, images, points3D)."
-        raise InputError("folder-missing", message, path=folder)
+        message = "The folder does not exist."
+        remedy = "Give that of a COLMAP model (cameras, images, points3D)."
+        raise InputError("folder-missing", message, path=folder, remedy=remedy)
     suffix = next((s for s in (".bin", ".txt") if all((folder / (n + s)).exists() for n in _REQUIRED)), None)
     if suffix is None:
         message = "The folder has no COLMAP model: cameras, images and points3D, all .bin or all .txt, are needed."
@@ -82,14 +82,14 @@ def _check_model_files(folder: Path) -> None:
 
 
 def _check_binary(file: Path, size: int, record_end: Callable[[_Bytes, int], int]) -> None:
-    cut_off = "the file is shorter than its number of records requires: it is truncated, copy it again"
+    cut_off, remedy = "The file is shorter than its number of records requires.", "Copy it again."
     if size < 8:
-        raise InputError("file-cut-off", cut_off, path=file)
+        raise InputError("file-cut-off", cut_off, path=file, remedy=remedy)
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         record = _Bytes(data, size)
         (count,) = struct.unpack_from("<Q", data)
         if count > size:
-            raise InputError("file-cut-off", cut_off, path=file)
+            raise InputError("file-cut-off", cut_off, path=file, remedy=remedy)
         at = 8
         for number in range(count):
             try:
@@ -193,14 +193,14 @@ def read_sparse(path: Path) -> SparseModel:
     return model
 
 
+def lens_of_colmap(camera: Any) -> Camera:
+    """Return a `pycolmap.Camera` as a lens."""
+    return Camera(camera.model_name, int(camera.width), int(camera.height), np.array(camera.params, np.float64))
+
+
 def flatten(reconstruction: Any) -> SparseModel:
     """Return a `pycolmap.Reconstruction` as arrays; images without a pose and stray observations are left out."""
-    cameras = {
-        int(camera_id): Camera(
-            camera.model_name, int(camera.width), int(camera.height), np.array(camera.params, dtype=np.float64)
-        )
-        for camera_id, camera in reconstruction.cameras.items()
-    }
+    cameras = {int(camera_id): lens_of_colmap(camera) for camera_id, camera in reconstruction.cameras.items()}
     images = [reconstruction.images[image_id] for image_id in sorted(reconstruction.reg_image_ids())]
     poses = [image.cam_from_world().matrix() for image in images]
     pose = np.array(poses, dtype=np.float64).reshape(-1, 3, 4)
@@ -290,12 +290,11 @@ def _observations(images: list[Any], point_ids: IntArray) -> tuple[IntArray, Int
     owner: list[NDArray[np.uint64]] = [np.empty(0, dtype=np.uint64)]
     source: list[IntArray] = [np.empty(0, dtype=np.int64)]
     for index, image in enumerate(images):
-        points = image.points2D
+        points = image.get_observation_points2D()  # most keypoints observe none: Python would visit each of them
         ids = np.fromiter((point.point3D_id for point in points), dtype=np.uint64, count=len(points))
-        seen = ids != _INVALID_POINT
-        xy.append(np.asarray(unit.cam_from_img(points)).reshape(-1, 2)[seen])
-        owner.append(ids[seen])
-        source.append(np.full(int(seen.sum()), index, dtype=np.int64))
+        xy.append(np.asarray(unit.cam_from_img(points)).reshape(-1, 2))
+        owner.append(ids)
+        source.append(np.full(len(ids), index, dtype=np.int64))
     obs_image, obs_owner = np.concatenate(source), np.concatenate(owner).astype(np.int64)
     obs_point = np.searchsorted(point_ids, obs_owner).astype(np.int64)
     order = np.lexsort((obs_image, obs_point))

@@ -193,7 +193,7 @@ def _without_measurer(name: str) -> list[str]:
     return [bare for bare in (*before, *after) if bare]
 
 
-def proposals(found: Sequence[str], vocabulary: Mapping[str, str]) -> str:
+def nearest_columns(found: Sequence[str], vocabulary: Mapping[str, str]) -> str:
     """Return what the columns `found` may mean, as a sentence with a space before it; empty: nothing is near."""
     near = []
     for text in found:
@@ -207,6 +207,6 @@ def proposals(found: Sequence[str], vocabulary: Mapping[str, str]) -> str:
     return f" Perhaps {', '.join(near[:12])}: rename the columns." if near else ""
 
 
-def listed(found: Sequence[str]) -> str:
+def listed_columns(found: Sequence[str]) -> str:
     """Return the names of columns for a message."""
     return ", ".join(text.strip()[:40] or "(unnamed)" for text in found[:20]) + (" …" if len(found) > 20 else "")

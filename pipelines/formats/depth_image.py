@@ -80,8 +80,9 @@ def _read_exr(path: Path) -> DepthImage:
         raise InputError("size-differs", f"{message} It is cut off or damaged.", path=path)
     chosen = _depth_channel(names)
     if chosen is None:
-        message = f"None of the channels {', '.join(names)[:200]} is depth: name it Z, or write it alone."
-        raise InputError("depth-channels", message, path=path)
+        message = f"None of the channels {', '.join(names)[:200]} is depth."
+        remedy = "Name it Z, or write it alone."
+        raise InputError("depth-channels", message, path=path, remedy=remedy)
     try:
         channels = _exr_channels(OpenEXR.File(str(path), separate_channels=True))
         pixels = channels[chosen]

@@ -18,6 +18,7 @@ from PIL import ExifTags
 from pipelines.core.types import Vector3
 from pipelines.formats.exif_time import NO_TIMES, TimeSource, TimeTags, times_of
 from pipelines.formats.photo_blocks import find_blocks
+from pipelines.formats.tables import with_decimal_point
 from pipelines.formats.tiff_tags import Tag, read_directory
 from pipelines.formats.xmp import Xmp, number_of, read_packets
 
@@ -348,7 +349,7 @@ def _length_m(text: str) -> float | None:
     found = re.fullmatch(r"\s*([+-]?\d+(?:[.,]\d*)?)\s*(m|metres|meters|ft|feet)?\.?\s*", text, re.IGNORECASE)
     if found is None:
         return None
-    return float(found[1].replace(",", ".")) * (_FOOT_M if (found[2] or "").casefold().startswith("f") else 1.0)
+    return float(with_decimal_point(found[1])) * (_FOOT_M if (found[2] or "").casefold().startswith("f") else 1.0)
 
 
 def _direction(tags: Mapping[str, Tag]) -> float | None:

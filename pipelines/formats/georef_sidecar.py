@@ -21,7 +21,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
 from pipelines.core.files import replace_text
 from pipelines.core.products import Product, Remark
-from pipelines.core.sentences import without_commands
+from pipelines.core.sentences import without_folders
 from pipelines.core.types import Matrix4, Quaternion, Row7, Vector3, vector3
 from pipelines.formats.iso_metadata import (
     PLAN_SIGMA,
@@ -287,7 +287,7 @@ def _of_crs(sidecar: CrsSidecar, name: str) -> IsoMetadata:
         lineage=(
             f"Coordinates by the operation {sidecar.operation}"
             + ("." if known is None else f", whose published accuracy is {known} m."),
-            *(f"Assumed: {without_commands(text)}." for text in sidecar.assumed),
+            *(f"Assumed: {without_folders(text)}." for text in sidecar.assumed),
             *_sentences(sidecar.cautions),
         ),
         quality=(
@@ -307,4 +307,4 @@ def _heights(datum: VerticalDatum, crs_wkt: str) -> str:
 
 
 def _sentences(cautions: tuple[Remark, ...]) -> list[str]:
-    return [without_commands(caution.sentence) for caution in cautions]
+    return [without_folders(caution.sentence) for caution in cautions]

@@ -62,11 +62,25 @@ class RasterFrame:
 
 @dataclass(frozen=True)
 class Band:
-    """Meaning of a band: description, unit (empty: none) and colour."""
+    """Meaning of a band: description, unit (empty: none), colour, and of a narrow one its wavelength and width."""
 
     description: str
     unit: str = ""
     colour: Literal["Gray", "Red", "Green", "Blue", "Alpha"] = "Gray"
+    wavelength_nm: float | None = None
+    fwhm_nm: float | None = None
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Return the items of GDAL's metadata by domain: those of IMAGERY, and as ENVI names them."""
+        plain: dict[str, str] = {}
+        imagery: dict[str, str] = {}
+        if self.wavelength_nm is not None:
+            plain |= {"wavelength": f"{self.wavelength_nm:g}", "wavelength_units": "Nanometers"}
+            imagery["CENTRAL_WAVELENGTH_UM"] = f"{self.wavelength_nm / 1000:g}"
+        if self.fwhm_nm is not None:
+            plain["fwhm"] = f"{self.fwhm_nm:g}"
+            imagery["FWHM_UM"] = f"{self.fwhm_nm / 1000:g}"
+        return {domain: items for domain, items in (("", plain), ("IMAGERY", imagery)) if items}
 
 
 @dataclass(frozen=True)
@@ -186,8 +200,9 @@ def _opened(path: Path) -> Iterator[Any]:
         with rasterio.open(path, driver="VRT" if path.suffix.lower() == ".vrt" else "GTiff") as raster:
             yield raster
     except RasterioError as error:
-        message = f"The raster cannot be read: {error}. Make it again with `georef`."
-        raise InputError("raster-unreadable", message, path=path) from error
+        message = f"The raster cannot be read: {error}."
+        remedy = "Make it again with `georef`."
+        raise InputError("raster-unreadable", message, path=path, remedy=remedy) from error
 
 
 def write_vrt(
@@ -222,7 +237,7 @@ def sampled_raster(path: Path, xy: FloatArray) -> FloatArray:
     return np.where(values == NODATA, np.nan, values)
 
 
-def frame_of(path: Path) -> RasterFrame:
+def raster_frame(path: Path) -> RasterFrame:
     """Return the place of a raster's cells."""
 
     with _opened(path) as raster:
@@ -231,6 +246,7 @@ def frame_of(path: Path) -> RasterFrame:
 
 
 def is_same_crs(first: RasterFrame, second: RasterFrame) -> bool:
+    """Return whether two rasters have one CRS, however it is written."""
     from rasterio.crs import CRS
 
     return bool(CRS.from_wkt(first.wkt) == CRS.from_wkt(second.wkt))
@@ -331,6 +347,10 @@ def _vrt(
             sizes.append((part.width, part.height))
     for number, band in enumerate(kind.bands, start=1):
         element = ElementTree.SubElement(root, "VRTRasterBand", dataType=_GDAL_TYPE[kind.dtype], band=str(number))
+        for domain, items in band.metadata().items():
+            of_band = ElementTree.SubElement(element, "Metadata", {"domain": domain} if domain else {})
+            for key, value in items.items():
+                ElementTree.SubElement(of_band, "MDI", key=key).text = value
         ElementTree.SubElement(element, "Description").text = band.description
         if band.unit:
             ElementTree.SubElement(element, "UnitType").text = band.unit

@@ -25,7 +25,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.exif import RTK_FIXED, RTK_FLOAT
 from pipelines.formats.gps_time import WEEK_S, unix_from_gps, unix_from_week
-from pipelines.formats.tables import number_of, numbered_lines, refuse_first, require_range, require_rows
+from pipelines.formats.tables import cell_number, numbered_lines, refuse_first, require_range, require_rows
 from pipelines.formats.trajectory_csv import PoseTable
 from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
 
@@ -184,10 +184,10 @@ def _numbers(cells: Sequence[str], places: int, path: Path, line: int) -> list[f
     if len(cells) < places:
         message = f"The line has {len(cells) + 2} cells, expected time, position, quality …"
         raise InputError("wrong-columns", message, path=path, line=line)
-    values = [number_of(text, path=path, line=line, field="position") for text in cells[:places]]
+    values = [cell_number(text, path=path, line=line, field="position") for text in cells[:places]]
     if places == 7:
         values = [_degrees(cells[0], values[:3]), _degrees(cells[3], values[3:6]), values[6]]
-    rest = [number_of(text, path=path, line=line, field="quality and σ") for text in cells[places : places + 8]]
+    rest = [cell_number(text, path=path, line=line, field="quality and σ") for text in cells[places : places + 8]]
     return values + rest + [np.nan] * (8 - len(rest))
 
 
@@ -217,7 +217,7 @@ def _times(clock: str, rows: Sequence[tuple[int, list[str]]], path: Path) -> Flo
             return unix_from_gps(time_s)
         return time_s - _JST_S if clock == "JST" else time_s
     week, second = np.array(
-        [[number_of(text, path=path, line=at, field="time") for text in cells] for at, cells in rows]
+        [[cell_number(text, path=path, line=at, field="time") for text in cells] for at, cells in rows]
     ).T
     good = (week >= 0) & (week < 1e5) & (second >= 0) & (second <= WEEK_S)
     lines = [at for at, _ in rows]

@@ -125,10 +125,10 @@ class _Stream:
 def _damaged(path: Path, what: str, payload: int | None = None) -> InputError:
     return InputError(
         "telemetry-damaged",
-        f"The video's telemetry cannot be read: {what}. Copy the file from the camera again, or give --trajectory: "
-        "then the telemetry is not read.",
+        f"The video's telemetry cannot be read: {what}.",
         path=path,
         line=None if payload is None else payload + 1,
+        remedy="Copy the file from the camera again, or give --trajectory: then the telemetry is not read.",
     )
 
 

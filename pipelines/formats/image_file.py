@@ -110,8 +110,9 @@ def inspect_image(data: bytes, path: Path, *, decode: bool = True) -> ImageFile:
             file), or it does not decode.
     """
     if data[:4] in _BIG_TIFF:
-        message = "The file is a BigTIFF, which is not read. Convert it to a plain TIFF."
-        raise InputError("big-tiff", message, path=path)
+        message = "The file is a BigTIFF, which is not read."
+        remedy = "Convert it to a plain TIFF."
+        raise InputError("big-tiff", message, path=path, remedy=remedy)
     header = image_header(data)
     if header is None:
         raise InputError("not-an-image", "The file is not a JPEG, PNG or TIFF image.", path=path)

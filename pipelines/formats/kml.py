@@ -37,7 +37,9 @@ def read_kml(data: bytes, refusal: Callable[..., InputError]) -> list[Any]:
     try:
         parser.Parse(data, True)
     except ExpatError as error:
-        raise refusal("boundary-unreadable", f"is no well-formed KML: {error}. Write it again.") from error
+        raise refusal(
+            "boundary-unreadable", f"is no well-formed KML: {error}.", remedy="Write it again."
+        ) from error
     return reader.shapes
 
 
@@ -67,7 +69,9 @@ class _Reader:
             self._track = []
 
     def entity(self, name: str, *_: Any) -> None:
-        raise self._refusal("boundary-entities", f"declares the entity {name[:40]}, which is not read. Remove it.")
+        raise self._refusal(
+            "boundary-entities", f"declares the entity {name[:40]}, which is not read.", remedy="Remove it."
+        )
 
     def text(self, text: str) -> None:
         if self._open[-1] in ("coordinates", "coord"):

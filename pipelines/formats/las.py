@@ -22,7 +22,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.formats.cloud_ply import CloudChunk, CloudPoints
-from pipelines.formats.las_head import InOrder, LasHead, read_head
+from pipelines.formats.las_head import InOrder, LasHead, read_las_head
 from pipelines.geodesy.geotiff_keys import FileCrs
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def open_las(path: Path) -> LasFile:
     """
     size = file_size(path)
     with _damage(path):
-        head = read_head(path, size)
+        head = read_las_head(path, size)
         with _opened(path, head) as file:
             header = file.header
             count, record = int(header.point_count), int(header.point_format.size)
@@ -223,8 +223,9 @@ def read_surface(path: Path, size: int) -> Iterator[CloudPoints]:
     with _damage(path), _opened(path, open_las(path).head) as file:
         lacking = (_EXTRA.keys() | _COVARIANCE.keys()) - set(file.header.point_format.dimension_names)
         if lacking:
-            message = f"The cloud has no {', '.join(sorted(lacking))}. Make it with `georef export-cloud`."
-            raise InputError("cloud-without-sigma", message, path=path)
+            message = f"The cloud has no {', '.join(sorted(lacking))}."
+            remedy = "Make it with `georef export-cloud`."
+            raise InputError("cloud-without-sigma", message, path=path, remedy=remedy)
         for record in file.chunk_iterator(size):
             cov = np.empty((len(record), 3, 3), dtype=np.float32)
             for name, (row, column) in _COVARIANCE.items():

@@ -45,7 +45,7 @@ class LasHead:
     table_at: int | None = None
 
 
-def read_head(path: Path, size: int) -> LasHead:
+def read_las_head(path: Path, size: int) -> LasHead:
     """Return the head of a file of `size` bytes.
 
     Raises:
@@ -153,8 +153,9 @@ def _missing_table(path: Path, stream: BinaryIO, offset: int, size: int, found: 
     """
     compression = found.get(("laszip encoded", 22204), [b""])[0].ljust(16, b"\0")
     if struct.unpack_from("<H", compression)[0] == _POINTWISE:
-        message = "The points are compressed as by LASzip before version 2, without chunks. Write it again as LAZ."
-        raise InputError("laz-without-chunks", message, path=path)
+        message = "The points are compressed as by LASzip before version 2, without chunks."
+        remedy = "Write it again as LAZ."
+        raise InputError("laz-without-chunks", message, path=path, remedy=remedy)
     stream.seek(offset)
     table = struct.unpack("<q", stream.read(8).ljust(8, b"\0"))[0]
     is_streamed = table in (-1, 0)

@@ -41,7 +41,13 @@ def write_mesh_ply(
     face = np.empty(len(faces), [("vertex_indices", "<i4", (3,))])
     face["vertex_indices"] = faces
     elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
-    PlyData(elements, byte_order="<").write(str(path))
+    # plyfile writes lists one by one, 2 µs each. Here each begins with its length.
+    rows = np.empty(len(faces), [("length", "u1"), ("vertex_indices", "<i4", (3,))])
+    rows["length"], rows["vertex_indices"] = 3, faces
+    with path.open("wb") as file:
+        file.write((PlyData(elements, byte_order="<").header + "\n").encode("ascii"))
+        file.write(vertex.data)
+        file.write(rows.data)
 
 
 def read_mesh_ply(path: Path) -> tuple[FloatArray, IntArray]:
@@ -63,7 +69,7 @@ def write_oriented_points(path: Path, points: FloatArray, normals: FloatArray) -
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
 
 
-def png_of(image: ByteArray) -> bytes:
+def texture_png(image: ByteArray) -> bytes:
     """Return an image (H, W, 3) RGB as PNG."""
     return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))[1].tobytes())
 
@@ -76,7 +82,7 @@ def write_mesh_glb(
     The material is unlit, since the photographs have the light of the day, and seen from both sides.
     """
     position, place = vertices.astype("<f4"), uv.astype("<f4")
-    data = [position.tobytes(), place.tobytes(), faces.astype("<u4").tobytes(), png_of(image)]
+    data = [position.tobytes(), place.tobytes(), faces.astype("<u4").tobytes(), texture_png(image)]
     start = np.cumsum([0, *(len(part) + -len(part) % 4 for part in data)]).tolist()
     targets: tuple[dict[str, int], ...] = ({"target": _ARRAY}, {"target": _ARRAY}, {"target": _ELEMENTS}, {})
     primitive = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
@@ -111,7 +117,7 @@ def write_mesh_glb(
 
 def write_mesh_obj(path: Path, vertices: FloatArray, faces: IntArray, uv: FloatArray, image: ByteArray) -> None:
     """Write an OBJ with its material (.mtl) and texture (.png) beside it; vertices in millimetres or finer."""
-    path.with_suffix(".png").write_bytes(png_of(image))
+    path.with_suffix(".png").write_bytes(texture_png(image))
     path.with_suffix(".mtl").write_text(f"newmtl photographs\nKa 0 0 0\nKd 1 1 1\nmap_Kd {path.stem}.png\n")
     with path.open("w", encoding="ascii") as file:
         file.write(f"mtllib {path.stem}.mtl\nusemtl photographs\n")

@@ -86,8 +86,9 @@ class _Scene:
         used = set(self.document.get("extensionsRequired", ())) | set(self.document.get("extensionsUsed", ()))
         unread = [name for name in _UNREAD if name in used]
         if unread:
-            message = f"The glb uses {', '.join(unread)}, which is not read. Export it as plain triangles."
-            raise InputError("glb-extension", message, path=self.path)
+            message = f"The glb uses {', '.join(unread)}, which is not read."
+            remedy = "Export it as plain triangles."
+            raise InputError("glb-extension", message, path=self.path, remedy=remedy)
         faces = vertices = 0
         for number, to_scene in self._meshes():
             for part in range(len(self.document["meshes"][number]["primitives"])):
@@ -183,8 +184,9 @@ class _Scene:
             raise InputError("glb-accessor", message, path=self.path)
         view = self.document["bufferViews"][accessor["bufferView"]]
         if view.get("buffer", 0) != 0 or "uri" in self.document["buffers"][0]:
-            message = "The vertices of the glb lie in another file. Export it with all its data inside."
-            raise InputError("glb-external", message, path=self.path)
+            message = "The vertices of the glb lie in another file."
+            remedy = "Export it with all its data inside."
+            raise InputError("glb-external", message, path=self.path, remedy=remedy)
         dtype, width, count = np.dtype(_KINDS[accessor["componentType"]]), _WIDTHS[kind], int(accessor["count"])
         start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
         stride = int(view.get("byteStride", 0)) or width * dtype.itemsize

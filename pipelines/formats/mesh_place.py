@@ -80,8 +80,9 @@ def placed(mesh: TriangleMesh, *, crs_stated: bool, offset_stated: bool, flag: s
     for one in offsets[1:]:
         if not offset_stated and np.abs(_offset(one) - _offset(offsets[0])).max() > _SAME_OFFSET:
             texts = " and ".join(f"{_shown(_offset(each))} in {each.path.name}" for each in (offsets[0], one))
-            message = f"Two files beside the mesh state different offsets: {texts}. Give {flag}-offset."
-            raise InputError("mesh-offsets-differ", message, path=path, field=flag)
+            message = f"Two files beside the mesh state different offsets: {texts}."
+            remedy = f"Give {flag}-offset."
+            raise InputError("mesh-offsets-differ", message, path=path, field=flag, remedy=remedy)
     enu = next((one.enu for one in found if one.enu is not None), None)
     shift = np.zeros(3) if offset_stated or not offsets else _offset(offsets[0])
     if shift.any():
@@ -186,11 +187,9 @@ def _differing_crs(path: Path, found: list[PlaceFile], flag: str) -> Iterator[Re
     texts = [" ".join(one.crs.split()).lower() or "enu" for one in said]
     if len(set(texts)) > 1:
         shown = ", ".join(f"{(one.crs or 'ENU')[:60]!r} in {one.path.name}" for one in said)
-        sentence = (
-            f"{path.name}: files beside it name its CRS in different words: {shown}. The first counts; "
-            f"{flag}-crs overrules them."
-        )
-        yield Remark(code=f"{flag.removeprefix('--')}-crs-stated-twice", sentence=sentence)
+        sentence = f"{path.name}: files beside it name its CRS in different words: {shown}. The first counts."
+        code, remedy = f"{flag.removeprefix('--')}-crs-stated-twice", f"{flag}-crs overrules them."
+        yield Remark(code=code, sentence=sentence, remedy=remedy)
 
 
 def _offset(one: PlaceFile) -> FloatArray:

@@ -34,7 +34,8 @@ from pipelines.formats.xml_events import OFF, XmlReader, read_xml
 MARKERS = "Metashape's markers"
 _MAX_BYTES = 64 * 1024 * 1024
 _LONGEST_CRS = 1 << 16
-_NO_MARKERS = "no marker has coordinates: export markers with their reference"
+_NO_MARKERS = "No marker has coordinates."
+_EXPORT_MARKERS = "Export markers with their reference."
 
 
 def read_markers_xml(path: Path) -> GroundPoints:
@@ -96,7 +97,7 @@ class _Reader(XmlReader):
 
     def result(self) -> GroundPoints:
         if not self._points:
-            raise InputError("no-markers", _NO_MARKERS, path=self.path)
+            raise InputError("no-markers", _NO_MARKERS, path=self.path, remedy=_EXPORT_MARKERS)
         known = {point.name for point in self._points}
         marks = [
             ListedMark(line, self._names[marker], self._labels.get(camera, f"camera {camera}"), x, y)
@@ -193,7 +194,7 @@ def read_markers(path: Path) -> GroundPoints:
             xyz = (row.finite("x"), row.finite("y"), row.finite("z"))
             points.append(ListedPoint(row.line, row.text("label"), xyz, *_sigma_m(row), not _is_enabled(row)))
     if not points:
-        raise InputError("no-markers", _NO_MARKERS, path=path)
+        raise InputError("no-markers", _NO_MARKERS, path=path, remedy=_EXPORT_MARKERS)
     return GroundPoints(
         path=path,
         kind=REFERENCE,

@@ -32,7 +32,7 @@ from pipelines.formats.solved_cameras import (
     TiePoints,
     not_placed,
     solved_cameras,
-    without_outliers,
+    without_far_observations,
 )
 from pipelines.geometry.lens_fit import Brown, ForeignLens, brown_lens, fisheye_lens
 from pipelines.geometry.rotations import exp_so3
@@ -138,7 +138,7 @@ def read_reconstruction(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     lenses = _lenses(model.cameras, {shot.camera for shot in model.shots.values()}, path)
     ties = _tie_points(model, photographs, path.with_name(TRACKS))
     solved = solved_cameras(path, OPENSFM, photographs, lenses, photo_size, ties=ties, remarks=remarks)
-    return without_outliers(solved, _OUTLIER)
+    return without_far_observations(solved, _OUTLIER)
 
 
 def read_shots(path: Path, photo_size: PhotoSize) -> SolvedCameras:

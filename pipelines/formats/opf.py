@@ -194,16 +194,18 @@ def read_opf_points(path: Path) -> GroundPoints:
     points, marks = [], []
     definitions = {point.geolocation.crs.definition for point in found}
     if len(definitions) > 1:
-        message = f"The control points are in {len(definitions)} CRSs: export those of one."
-        raise InputError("several-crs", message, path=path, field="crs")
+        message = f"The control points are in {len(definitions)} CRSs."
+        remedy = "Export those of one."
+        raise InputError("several-crs", message, path=path, field="crs", remedy=remedy)
     for point in found:
         place = point.geolocation
         if place.crs.geoid_height is not None:
             message = (
                 f"The heights of {point.id} are above a geoid of which one height alone is stated, "
-                f"{place.crs.geoid_height:g}. Export the project with a geoid model, or list the points otherwise."
+                f"{place.crs.geoid_height:g}."
             )
-            raise InputError("geoid-height", message, path=path, field="geoid_height")
+            remedy = "Export the project with a geoid model, or list the points otherwise."
+            raise InputError("geoid-height", message, path=path, field="geoid_height", remedy=remedy)
         sigma_h_m, sigma_v_m = max(place.sigmas[:2]), place.sigmas[2]
         points.append(
             ListedPoint(
@@ -238,10 +240,9 @@ def _photographs(project: _Project, path: Path) -> dict[int, str]:
 def _project(path: Path) -> _Project:
     project = load_json(_Project, path)
     if not re.fullmatch(r"1\.\d{1,4}", project.version):  # another minor version breaks nothing, a draft may
-        message = (
-            f"The project is of version {project.version[:20]!r} of OPF, and 1.0 to 1.9 are read. Export it again."
-        )
-        raise InputError("opf-version", message, path=path, field="version")
+        message = f"The project is of version {project.version[:20]!r} of OPF, and 1.0 to 1.9 are read."
+        remedy = "Export it again."
+        raise InputError("opf-version", message, path=path, field="version", remedy=remedy)
     return project
 
 
@@ -283,8 +284,9 @@ def _beside(uri: str, path: Path) -> Path:
     except ValueError:
         parts, name = urlsplit("x:"), ""
     if parts.scheme or parts.netloc or not stays_inside(name):
-        message = f"The URI {uri[:80]!r} leads out of the folder of the project. Export it with its files."
-        raise InputError("file-outside-folder", message, path=path, field="uri")
+        message = f"The URI {uri[:80]!r} leads out of the folder of the project."
+        remedy = "Export it with its files."
+        raise InputError("file-outside-folder", message, path=path, field="uri", remedy=remedy)
     return path.parent / name
 
 

@@ -1,8 +1,12 @@
-"""Writing of OPF 1.0 projects (Pix4D/opf-spec): solved cameras, tie points, control points with marks.
+"""Writing of OPF 1.0 projects (Pix4D/opf-spec): solved cameras, tie points, control points with marks, the surface.
 
 A project is one folder. `project.opf` lists its files; photographs are listed by their names, relative to it. Poses
 and points are in the processing CRS: metres in the directions of a map's axes, shifted to the scene. Conventions
 are those of `opf`, which reads such projects.
+
+OPF has an item for point clouds and none for Gaussians. Those are an extension, as the specification names it: an
+item `ext_georefgs_gaussian_splats` with a resource `application/ext-georefgs-gaussian-splats+ply`, a 3DGS PLY whose
+frame is the processing CRS. Programs that do not know an extension leave it out.
 """
 
 from __future__ import annotations
@@ -13,7 +17,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -23,20 +26,20 @@ from pipelines.core.files import replace_text
 from pipelines.core.products import dump_json
 from pipelines.core.types import FloatArray
 from pipelines.formats.camera_files import lens_of
+from pipelines.formats.opf_gltf import ArrayFile, Json, write_points
 from pipelines.formats.opf_tracks import MATCHES
 from pipelines.geometry.cameras import Camera, distort, parameters_in, undistort
 from pipelines.geometry.rotations import omega_phi_kappa_deg
 from pipelines.geometry.sparse_model import SparseModel
 
 PROJECT_FILE = "project.opf"
+POINT_CLOUD, SPLATS = "point_cloud", "ext_georefgs_gaussian_splats"  # types of items
+SPLATS_FORMAT = "application/ext-georefgs-gaussian-splats+ply"
 _SAMPLES = 25  # rays along each side of the image, by which a lens is fitted
 _UNKNOWN_TIME = "1970-01-01T00:00:00"  # OPF demands one; without a zone it is not known
 _BANDS = (("R", 0.2126), ("G", 0.7152), ("B", 0.0722))  # with their weights in a grey image
 _NAMESPACE = uuid.UUID("6f1e2a52-7a55-5c0e-9f5e-0e6f1c1d7a10")
-_FLOAT, _UNSIGNED, _BYTE = 5126, 5125, 5121
-_Y_UP_FROM_Z_UP = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]  # by columns
 _COVARIANCE = "GEOREFGS_covariance"
-Json = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,7 @@ class OpfScene:
         photographs: what was measured of each photograph of the model, in its order.
         rolling: keys of cameras with a rolling shutter.
         covariances: (n, 6, 6) of (δθ [rad], δc [m]) along the axes of the processing CRS; None: not known.
+        made: resources of what was made of the calibration and lies in the folder, by type of their item.
     """
 
     name: str
@@ -107,6 +111,7 @@ class OpfScene:
     points: Sequence[OpfPoint]
     rolling: frozenset[int] = frozenset()
     covariances: FloatArray | None = None
+    made: Mapping[str, Sequence[Json]] = field(default_factory=dict)
 
 
 def write_opf(folder: Path, scene: OpfScene) -> float:
@@ -125,30 +130,33 @@ def write_opf(folder: Path, scene: OpfScene) -> float:
         form = f"application/opf-{name}+json"
         file = f"{name.replace('-', '_')}.json"
         _write(folder / file, {"format": form, "version": "1.0", **content})
-        items[kind] = {
-            "id": str(uuid.uuid5(_NAMESPACE, f"{scene.name}/{kind}")),
-            "type": kind,
-            "resources": [{"uri": file, "format": form}],
-            "sources": [],
-        }
+        items[kind] = _item(scene.name, kind, [{"uri": file, "format": form}])
     items["calibration"]["resources"] += _write_tracks(folder, scene.model, uids)
+    for kind, resources in scene.made.items():
+        items[kind] = _item(scene.name, kind, resources)
     for kind, sources in {
         "input_cameras": ("camera_list",),
         "input_control_points": ("camera_list",),
         "calibration": ("input_cameras", "scene_reference_frame", "input_control_points"),
+        **dict.fromkeys(scene.made, ("scene_reference_frame", "calibration")),
     }.items():
         items[kind]["sources"] = [{"id": items[source]["id"], "type": source} for source in sources]
     project = {
         "format": "application/opf-project+json",
         "version": "1.0",
         "name": scene.name,
-        "description": "Cameras, tie points and control points",
+        "description": "Cameras, tie points, control points and what was made of them",
         "generator": {"name": "GeoRefGS", "version": __version__},
         "id": str(uuid.uuid5(_NAMESPACE, scene.name)),
         "items": list(items.values()),
     }
     _write(folder / PROJECT_FILE, project)
     return max((error for _, error in lenses.values()), default=0.0)
+
+
+def _item(project: str, kind: str, resources: Sequence[Json]) -> Json:
+    identity = str(uuid.uuid5(_NAMESPACE, f"{project}/{kind}"))
+    return {"id": identity, "type": kind, "resources": list(resources), "sources": []}
 
 
 def uid_of(name: str) -> int:
@@ -320,56 +328,27 @@ def _write_tracks(folder: Path, model: SparseModel, uids: Sequence[int]) -> list
     ranges = np.stack([offset & 0xFFFFFFFF, offset >> 32 | count << 8], axis=-1)
     colours = np.column_stack([model.point_rgb, np.full(len(count), 255, np.uint8)])
     positions = model.point_in_local.astype("<f4")
-    arrays = {
-        "positions": (positions, _FLOAT, "VEC3"),
-        "colors": (colours.astype("u1"), _BYTE, "VEC4"),
-        "match_camera_ids": (image.astype("<u4"), _UNSIGNED, "SCALAR"),
-        "match_ranges": (ranges.astype("<u4"), _UNSIGNED, "VEC2"),
-        "match_pixels": (pixels.astype("<f4"), _FLOAT, "VEC2"),
-        "match_features": (np.zeros((len(image), 2), "<u4"), _UNSIGNED, "VEC2"),
-        "match_scales": (np.ones(len(image), "<f4"), _FLOAT, "SCALAR"),
-    }
     if not len(count):
         return []
-    accessors: list[Json] = []
-    for number, (name, (values, kind, form)) in enumerate(arrays.items()):
-        (folder / f"{name}.bin").write_bytes(values.tobytes())
-        accessors.append({"bufferView": number, "componentType": kind, "count": len(values), "type": form})
-    accessors[0] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
-    accessors[1] |= {"normalized": True}
+    values = {
+        "positions": positions,
+        "colors": colours.astype("u1"),
+        "match_camera_ids": image.astype("<u4"),
+        "match_ranges": ranges.astype("<u4"),
+        "match_pixels": pixels.astype("<f4"),
+        "match_features": np.zeros((len(image), 2), "<u4"),
+        "match_scales": np.ones(len(image), "<f4"),
+    }
+    arrays = [ArrayFile.of(folder, name, array) for name, array in values.items()]
+    arrays[0].more = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    arrays[1].more = {"normalized": True}
     matches = {
         "cameraUids": list(uids),
         "cameraIds": 2,
         "pointIndexRanges": 3,
         "imagePoints": {"pixelCoordinates": 4, "featureIds": 5, "scales": 6},
     }
-    primitive = {
-        "attributes": {"POSITION": 0, "COLOR_0": 1},
-        "mode": 0,
-        "material": 0,
-        "extensions": {MATCHES: matches},
-    }
-    sizes = {name: values.nbytes for name, (values, _, _) in arrays.items()}
-    document = {
-        "asset": {
-            "version": "2.0",
-            "generator": "GeoRefGS",
-            "extensions": {"OPF_asset_version": {"version": "1.0"}},
-        },
-        "accessors": accessors,
-        "bufferViews": [{"buffer": number, "byteLength": size} for number, size in enumerate(sizes.values())],
-        "buffers": [{"uri": f"{name}.bin", "byteLength": size} for name, size in sizes.items()],
-        "extensionsRequired": ["KHR_materials_unlit"],
-        "extensionsUsed": ["KHR_materials_unlit", "OPF_asset_version", MATCHES],
-        "materials": [{"extensions": {"KHR_materials_unlit": {}}}],
-        "meshes": [{"primitives": [primitive]}],
-        "nodes": [{"mesh": 0, "matrix": _Y_UP_FROM_Z_UP}],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-    }
-    _write(folder / "tracks.gltf", document)
-    buffers = [{"uri": f"{name}.bin", "format": "application/gltf-buffer+bin"} for name in arrays]
-    return [{"uri": "tracks.gltf", "format": "model/gltf+json"}, *buffers]
+    return write_points(folder, "tracks", arrays, {"POSITION": 0, "COLOR_0": 1}, {MATCHES: matches})
 
 
 def _write(path: Path, document: Json) -> None:

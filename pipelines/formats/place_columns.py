@@ -12,9 +12,7 @@ from pipelines.core.types import FloatArray
 from pipelines.formats import column_names, tables
 
 _GEOGRAPHIC, _PROJECTED = ("longitude", "latitude"), ("x", "y")
-_RELATIVE = (
-    "The heights ({}) count from take-off or from the ground: give a column of heights above sea or ellipsoid."
-)
+_RELATIVE = "The heights ({}) count from take-off or from the ground."
 Height = Literal["altitude", "z", "ellipsoidal", "orthometric"]
 
 
@@ -79,10 +77,9 @@ def place_columns(
         missing = [name for group in present for name in group if name not in columns]
         raise tables.unknown_header(header, vocabulary, needed, path=path, line=line, missing=missing)
     if len(whole) == 2 and not projected and "ellipsoidal" not in columns:
-        message = (
-            "The header has both latitude,longitude,altitude and x,y,z. Remove one group, or name the CRS of x,y,z."
-        )
-        raise InputError("columns-ambiguous", message, path=path, line=line)
+        message = "The header has both latitude,longitude,altitude and x,y,z."
+        remedy = "Remove one group, or name the CRS of x,y,z."
+        raise InputError("columns-ambiguous", message, path=path, line=line, remedy=remedy)
     geographic = whole[0] == _GEOGRAPHIC and not (projected and len(whole) == 2)
     order: tuple[Height, ...] = ("altitude", "z") if geographic else ("z", "altitude")
     if not geographic and len(whole) == 2:  # of two groups with a height each
@@ -92,10 +89,11 @@ def place_columns(
     height = next((name for name in order if name in columns), None)
     if height is None and "relative" in columns:
         named = header[columns["relative"]].strip()[:40]
-        raise InputError("heights-relative", _RELATIVE.format(named), path=path, line=line)
+        remedy = "Give a column of heights above sea or ellipsoid."
+        raise InputError("heights-relative", _RELATIVE.format(named), path=path, line=line, remedy=remedy)
     if height is None:
         missing_height = "altitude" if geographic else "z"
-        message = f"The header has no column {missing_height}; it has {column_names.listed(header)}."
+        message = f"The header has no column {missing_height}; it has {column_names.listed_columns(header)}."
         raise InputError("column-missing", message, path=path, line=line)
     group = _GEOGRAPHIC if geographic else _PROJECTED
     coordinates = (*_GEOGRAPHIC, *_PROJECTED, "altitude", "z", "ellipsoidal", "orthometric", "relative")

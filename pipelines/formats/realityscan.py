@@ -54,8 +54,9 @@ def read_camera_csv(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     lines = tables.numbered_lines(path)
     found = header_line(lines)
     if found is None:
-        message = f"No line names the columns {', '.join(_NEEDED)}: export Internal/External camera parameters."
-        raise InputError("header-missing", message, path=path)
+        message = f"No line names the columns {', '.join(_NEEDED)}."
+        remedy = "Export Internal/External camera parameters."
+        raise InputError("header-missing", message, path=path, remedy=remedy)
     number, text = found
     cells = tables.split(text.lstrip("# "), ",", path=path, line=number)
     columns, _ = tables.named_columns(cells, _VOCABULARY, path, number)
@@ -100,11 +101,9 @@ def _refuse_degrees(center: FloatArray, path: Path) -> None:
     span = np.ptp(center, axis=0)
     within = (np.abs(center[:, :2]) <= (180.0, 90.0)).all() and span[:2].max() < _WIDEST_FLIGHT_DEG
     if within and (span[2] > 10 * span[:2].max() or np.abs(center[:, 2]).max() > 100 * span[:2].max() > 0):
-        message = (
-            f"x and y span {span[:2].max():.2g}, heights {span[2]:.2g}: they are longitude and latitude. Export "
-            "the cameras in a projected or local coordinate system."
-        )
-        raise InputError("positions-in-degrees", message, path=path, field="x, y")
+        message = f"x and y span {span[:2].max():.2g}, heights {span[2]:.2g}: they are longitude and latitude."
+        remedy = "Export the cameras in a projected or local coordinate system."
+        raise InputError("positions-in-degrees", message, path=path, field="x, y", remedy=remedy)
 
 
 def _lens(size: tuple[int, int], focal_mm: float, values: dict[str, float]) -> ForeignLens:

@@ -149,8 +149,9 @@ def _rotation(photograph: SolvedPhotograph, path: Path) -> FloatArray:
     off = np.abs(given @ given.T - np.eye(3)).max() if np.isfinite(given).all() else np.inf
     if not off <= _MOST_OFF_ROTATION or np.linalg.det(given) < 0:
         kind = "is mirrored" if off <= _MOST_OFF_ROTATION else "is no rotation: its axes have no length of 1"
-        message = f"The attitude of the photograph {photograph.name!r} {kind}. Export the cameras again."
-        raise InputError("rotation-impossible", message, path=path, field="rotation")
+        message = f"The attitude of the photograph {photograph.name!r} {kind}."
+        remedy = "Export the cameras again."
+        raise InputError("rotation-impossible", message, path=path, field="rotation", remedy=remedy)
     left, _, right = np.linalg.svd(given)
     return np.asarray(left @ right)
 
@@ -184,10 +185,10 @@ def _cameras(
         if not error <= limit:
             message = (
                 f"The lens of the camera {key[:80]!r} has no like among COLMAP's models: the nearest, "
-                f"{camera.model}, is {error:.1f} px off "
-                f"(limit {limit:.1f} px). Solve the cameras without skew (b2), or with fewer terms of distortion."
+                f"{camera.model}, is {error:.1f} px off (limit {limit:.1f} px)."
             )
-            raise InputError("lens-not-convertible", message, path=path, field="cameras")
+            remedy = "Solve the cameras without skew (b2), or with fewer terms of distortion."
+            raise InputError("lens-not-convertible", message, path=path, field="cameras", remedy=remedy)
         if error > _SAID_PX:
             replaced.append((key[:80], camera.model, error))
         cameras[number], scales[number] = _resized(camera, size)
@@ -252,7 +253,7 @@ def _points(ties: TiePoints | None, chosen: IntArray, count: int, path: Path) ->
     )
 
 
-def without_outliers(solved: SolvedCameras, most_of_side: float) -> SolvedCameras:
+def without_far_observations(solved: SolvedCameras, most_of_side: float) -> SolvedCameras:
     """Return the cameras without observations that lie further from their point than a share of the longer side."""
     model = solved.model
     in_cam = np.einsum(

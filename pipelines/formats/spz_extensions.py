@@ -77,8 +77,9 @@ def require_known_axes(extensions: bytes, path: Path | None = None) -> None:
         raise InputError("spz-extensions", "The SPZ file promises extensions, and has none.", path=path)
     for kind, payload in records:
         if kind == _AXES and payload != struct.pack("<I", _RIGHT_UP_BACK):
-            message = "The SPZ file states other axes than right, up, back. Write it with those."
-            raise InputError("spz-axes", message, path=path)
+            message = "The SPZ file states other axes than right, up, back."
+            remedy = "Write it with those."
+            raise InputError("spz-axes", message, path=path, remedy=remedy)
 
 
 def _records(extensions: bytes, path: Path | None) -> Iterator[tuple[int, bytes]]:

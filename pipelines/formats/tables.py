@@ -76,8 +76,9 @@ def read_lines(path: Path) -> list[str]:
                 _check_line(text, path, len(lines) + 1)
                 lines.append(text.removesuffix("\n"))
     except UnicodeDecodeError as error:  # of UTF-16; what is no UTF-8 is found line by line
-        message = "The file begins as UTF-16 does, and is none: save it as UTF-8."
-        raise InputError("not-text", message, path=path) from error
+        message = "The file begins as UTF-16 does, and is none."
+        remedy = "Save it as UTF-8."
+        raise InputError("not-text", message, path=path, remedy=remedy) from error
     if not any(map(str.strip, lines)):
         raise InputError("file-empty", "The file is empty.", path=path)
     return lines
@@ -90,10 +91,13 @@ def _check_line(text: str, path: Path, line: int) -> None:
         message = f"The line is longer than {LONGEST_LINE} characters, the limit."
         raise InputError("line-too-long", message, path=path, line=line)
     if _NO_UTF8.search(text):
-        raise InputError("not-utf8", "The text is not UTF-8: save the file as UTF-8.", path=path, line=line)
+        raise InputError(
+            "not-utf8", "The text is not UTF-8.", path=path, line=line, remedy="Save the file as UTF-8."
+        )
     if "\x00" in text:
-        message = "The file contains zero bytes: it is not text, or it is UTF-16. Save it as UTF-8."
-        raise InputError("not-text", message, path=path)
+        message = "The file contains zero bytes: it is not text, or it is UTF-16."
+        remedy = "Save it as UTF-8."
+        raise InputError("not-text", message, path=path, remedy=remedy)
 
 
 def numbered_lines(path: Path) -> list[tuple[int, str]]:
@@ -118,7 +122,7 @@ def _encoding(path: Path) -> str:
         return "utf-16" if handle.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
 
 
-def number_of(text: str, *, path: Path, line: int, field: str, decimal_comma: bool = False) -> float:
+def cell_number(text: str, *, path: Path, line: int, field: str, decimal_comma: bool = False) -> float:
     """Return the number in a cell as a person writes it; `nan`, `inf` and an empty cell are NaN.
 
     With `decimal_comma`, `46,02` is a number, because commas do not separate cells.
@@ -129,8 +133,8 @@ def number_of(text: str, *, path: Path, line: int, field: str, decimal_comma: bo
     cell = text.strip()
     if not cell:
         return math.nan
-    if decimal_comma and "." not in cell:
-        cell = cell.replace(",", ".", 1)
+    if decimal_comma:
+        cell = with_decimal_point(cell)
     try:
         if "_" in cell:  # Python's own digit grouping, which tables do not have
             raise ValueError(cell)
@@ -142,9 +146,15 @@ def number_of(text: str, *, path: Path, line: int, field: str, decimal_comma: bo
     return value if math.isfinite(value) else math.nan
 
 
+def with_decimal_point(text: str) -> str:
+    """Return the text of a number whose first comma is a point, unless it has a point: `46,02` is `46.02`."""
+    return text if "." in text else text.replace(",", ".", 1)
+
+
 def is_number(text: str, *, decimal_comma: bool = True) -> bool:
+    """Return whether a cell is one number, `nan` and `inf` among them; with `decimal_comma`, `46,02` is one."""
     try:
-        float(text.strip().replace(",", ".", 1) if decimal_comma else text)
+        float(with_decimal_point(text) if decimal_comma else text)
     except ValueError:
         return False
     return True
@@ -164,9 +174,9 @@ class Row:
     decimal_comma: bool = False
     units: Mapping[str, str] = field(default_factory=dict)  # that the header states, of the columns
 
-    def fault(self, code: str, message: str, column: str | None = None) -> InputError:
+    def fault(self, code: str, message: str, column: str | None = None, *, remedy: str = "") -> InputError:
         """Return the error of this line."""
-        return InputError(code, message, path=self.path, line=self.line, field=column)
+        return InputError(code, message, path=self.path, line=self.line, field=column, remedy=remedy)
 
     def text(self, column: str) -> str:
         """Return a cell, without spaces around it; empty if the row is too short."""
@@ -185,7 +195,7 @@ class Row:
         if column not in self.columns:
             return math.nan
         text, comma = self.text(column), self.decimal_comma
-        return number_of(text, path=self.path, line=self.line, field=column, decimal_comma=comma)
+        return cell_number(text, path=self.path, line=self.line, field=column, decimal_comma=comma)
 
     def finite(self, column: str) -> float:
         """Return the number of a cell that is not empty."""
@@ -338,8 +348,8 @@ def unknown_header(
     missing: Iterable[str] = (),
 ) -> InputError:
     """Return the error of a header without the columns that are needed: what was found, and what is near."""
-    lacks, near = ", ".join(missing), column_names.proposals(header, vocabulary)
-    found = column_names.listed(header)
+    lacks, near = ", ".join(missing), column_names.nearest_columns(header, vocabulary)
+    found = column_names.listed_columns(header)
     known = any(column_names.meaning_of(text, vocabulary) for text in header)
     message = (
         f"The header has no column {lacks}. It has {found}" if lacks else f"The header has the columns {found}"

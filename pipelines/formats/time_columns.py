@@ -28,7 +28,7 @@ def has_times(columns: Collection[str]) -> bool:
     return "timestamp" in columns or {"week", "tow"} <= set(columns)
 
 
-def times_of(table: tables.Table) -> tuple[FloatArray, bool]:
+def timestamps_of(table: tables.Table) -> tuple[FloatArray, bool]:
     """Return seconds since 1970 UTC (N,), and whether a time has no zone and is taken as UTC.
 
     Raises:
@@ -76,8 +76,8 @@ def _dates(table: tables.Table) -> Sequence[date]:
     for row, text in zip(table.rows, texts, strict=True):
         found = _DATE_LAST.fullmatch(text)
         if found is not None and day_first == month_first and found[1] != found[2] and "." not in text:
-            message = f"whether {text!r} begins with the day or the month is not known: write it as 2024-05-31"
-            raise row.fault("date-ambiguous", message, "date")
+            message = f"Whether {text!r} begins with the day or the month is not known."
+            raise row.fault("date-ambiguous", message, "date", remedy="Write it as 2024-05-31.")
         try:
             if found is None:
                 dates.append(_calendar(text))

@@ -18,7 +18,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.types import BoolArray, FloatArray, IntArray, rows_of
 from pipelines.formats import column_names, tables
 from pipelines.formats.place_columns import place_columns
-from pipelines.formats.time_columns import TIMES, has_times, times_of
+from pipelines.formats.time_columns import TIMES, has_times, timestamps_of
 from pipelines.geometry.rotations import geo_from_cam, map_from_cam, quat_xyzw_from_matrix
 
 
@@ -118,7 +118,7 @@ def read_trajectory(path: Path, *, projected: bool = False) -> PoseTable:
     xyz = place.numbers(table.rows)
     if place.geographic:
         _require_ranges(xyz[:, :2], place.plan, table)
-    time_s, zoneless = times_of(table) if has_times(table.columns) else (None, False)
+    time_s, zoneless = timestamps_of(table) if has_times(table.columns) else (None, False)
     attitudes, of_grid = _attitudes(table)
     return PoseTable(
         path=path,
@@ -158,8 +158,10 @@ def _read_table(path: Path) -> tuple[tables.Table, list[str]]:
     if not columns:
         raise tables.unknown_header(names, _VOCABULARY, _NEEDED, path=path, line=first + 1)
     if "image" not in columns and not has_times(columns):
-        message = f"The header has no column image and no column timestamp; it has {column_names.listed(names)}."
-        message += column_names.proposals(unknown, _VOCABULARY)
+        message = (
+            f"The header has no column image and no column timestamp; it has {column_names.listed_columns(names)}."
+        )
+        message += column_names.nearest_columns(unknown, _VOCABULARY)
         raise InputError("column-missing", message, path=path, line=first + 1)
     width, units = len(names), tables.units_of(names, columns)
     if separator is None:

@@ -211,8 +211,9 @@ def _read_gpkg(
         rows = list(zip(*(values[at].tolist() for at in order), strict=True))
         return str(meta["crs"]), [shapely.from_wkb(shape) for shape in shapes], rows
     except (*reading_errors(), shapely.errors.ShapelyError) as error:
-        message = f"cannot be read: {error}. Write it again with `{command}`."
-        raise InputError(f"{layer}-unreadable", message, path=path) from error
+        message = f"cannot be read: {error}."
+        remedy = f"Write it again with `{command}`."
+        raise InputError(f"{layer}-unreadable", message, path=path, remedy=remedy) from error
 
 
 def write_polygons_gpkg(path: Path, layer: str, polygons: Sequence[Any], rows: Sequence[Json], wkt: str) -> None:
@@ -277,6 +278,7 @@ def read_layers(path: Path, columns: Sequence[str] = (), *, field: str) -> list[
                 plan = shapely.from_wkb(shapes, on_invalid="ignore")
                 layers.append(ReadLayer(str(name), plan, known, meta["crs"] or ""))
     except reading_errors() as error:
-        message = f"cannot be read: {error}. Write it again, as GeoJSON."
-        raise InputError("boundary-unreadable", message, path=path, field=field) from error
+        message = f"cannot be read: {error}."
+        remedy = "Write it again, as GeoJSON."
+        raise InputError("boundary-unreadable", message, path=path, field=field, remedy=remedy) from error
     return layers

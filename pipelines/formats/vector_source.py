@@ -79,8 +79,9 @@ def tables_alone(path: Path, *, field: str | None = None) -> Iterator[Path]:
             layers = _registered(base)
         bad = next((view for view in views if view.lower() in layers or view.lower() in _OWN_TABLES), None)
         if bad is not None:
-            message = f"The layer {bad!r} is a view, whose SQL is not executed. Save it as a layer of its own."
-            raise InputError("layer-is-view", message, path=path, field=field)
+            message = f"The layer {bad!r} is a view, whose SQL is not executed."
+            remedy = "Save it as a layer of its own."
+            raise InputError("layer-is-view", message, path=path, field=field, remedy=remedy)
         yield copy
 
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from xml.etree.ElementTree import Element, ParseError
 
+from pipelines.formats.tables import with_decimal_point
+
 _RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
 _NOT_NAMES = (_RDF, "adobe:ns:meta/", "http://www.w3.org/XML/1998/namespace")
 _RDF_ATTRIBUTES = frozenset({"about", "ID", "parseType", "resource"})
@@ -93,7 +95,7 @@ def number_of(text: str) -> float | None:
     found = _NUMBER.match(text)
     if found is None or (found[2] is not None and float(found[2]) == 0.0):
         return None
-    value = float(found[1].replace(",", ".")) / float(found[2] or 1.0)
+    value = float(with_decimal_point(found[1])) / float(found[2] or 1.0)
     return value if math.isfinite(value) else None
 
 

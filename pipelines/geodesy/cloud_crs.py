@@ -138,20 +138,22 @@ class _Placing:
         what = f"states no CRS of places on Earth ({problems})" if problems else "states no CRS"
         return InputError(
             "crs-unknown",
-            f"{what}: give {self._flag}-crs EPSG:n, or EPSG:n+m with the vertical CRS.",
+            f"{what}.",
             path=self._path,
             field=self._flag,
+            remedy=f"Give {self._flag}-crs EPSG:n, or EPSG:n+m with the vertical CRS.",
         )
 
-    def _remark(self, kind: str, sentence: str) -> None:
-        self._remarks.append(Remark(code=f"{self._flag.removeprefix('--')}-{kind}", sentence=sentence))
+    def _remark(self, kind: str, sentence: str, remedy: str = "") -> None:
+        code = f"{self._flag.removeprefix('--')}-{kind}"
+        self._remarks.append(Remark(code=code, sentence=sentence, remedy=remedy))
 
     def _compare_plans(self, file: _Statement) -> None:
         """Note a CRS of the file that is overruled, and two of one file that differ."""
         if self._option.horizontal and file.horizontal and self._differ(self._option, file):
             self._remark(
                 "crs-overrules",
-                f"{self._path.name}: {self._flag}-crs, {_shown(self._option)}, overrules the CRS of the file's "
+                f"{self._path.name}: the stated CRS, {_shown(self._option)}, overrules the CRS of the file's "
                 f"{file.source}, {_shown(file)}.",
             )
         others = [one for one in self._sources if one.horizontal and one is not file]
@@ -159,8 +161,8 @@ class _Placing:
             self._remark(
                 "crs-disagrees",
                 f"{self._path.name}: its {file.source} state {_shown(file)}, its {others[0].source} "
-                f"{_shown(others[0])}. The header's WKT bit has the {file.source} count; {self._flag}-crs "
-                "overrules both.",
+                f"{_shown(others[0])}. The header's WKT bit has the {file.source} count.",
+                f"{self._flag}-crs overrules both.",
             )
 
     def _differ(self, one: _Statement, other: _Statement) -> bool:
@@ -202,10 +204,10 @@ class _Placing:
             if of_keys is not None and of_wkt is not None and abs(of_keys.size / of_wkt.size - 1) > most:
                 raise InputError(
                     "cloud-units-disagree",
-                    f"states two units of {what}: {of_keys.name} in its {_KEYS}, {of_wkt.name} in its {_WKT}. Give "
-                    f"{self._flag}-crs EPSG:n+m with the units of the coordinates.",
+                    (f"states two units of {what}: {of_keys.name} in its {_KEYS}, {of_wkt.name} in its {_WKT}."),
                     path=self._path,
                     field=self._flag,
+                    remedy=f"Give {self._flag}-crs EPSG:n+m with the units of the coordinates.",
                 )
 
     def _with_heights(self, plan: _Statement) -> tuple[PointCrs, _Statement]:
@@ -215,15 +217,15 @@ class _Placing:
         if chosen is not None and self._option.has_heights and not _same_datum(self._option, chosen):
             raise InputError(
                 "vertical-stated-twice",
-                f"{self._flag}-crs has heights above {self._option.datum}, {self._flag}-vertical is {chosen}. Give "
-                "one of them.",
+                (f"{self._flag}-crs has heights above {self._option.datum}, {self._flag}-vertical is {chosen}."),
                 field=f"{self._flag}-vertical",
+                remedy="Give one of them.",
             )
         if chosen is not None and not self._option.has_heights:
             if heights.has_heights and not _same_datum(heights, chosen):
                 self._remark(
                     "vertical-overrules",
-                    f"{self._path.name}: {self._flag}-vertical, {chosen}, overrules the datum of the file's "
+                    f"{self._path.name}: the stated datum, {chosen}, overrules the datum of the file's "
                     f"{heights.source}, {heights.datum}.",
                 )
             stated = replace(_NOTHING, source=f"{self._flag}-vertical", is_ellipsoidal=chosen.epsg is None)
@@ -233,9 +235,10 @@ class _Placing:
             if problem:
                 raise InputError(
                     "vertical-datum-unknown",
-                    f"states its heights by {problem}. Give {self._flag}-vertical: ellipsoidal or EPSG:n.",
+                    f"states its heights by {problem}.",
                     path=self._path,
                     field=self._flag,
+                    remedy=f"Give {self._flag}-vertical: ellipsoidal or EPSG:n.",
                 )
             return parse_crs(plan.horizontal, path=self._path), heights
         self._compare_heights(heights)
@@ -248,7 +251,7 @@ class _Placing:
             return
         if heights is self._option:
             sentence = (
-                f"{self._path.name}: {self._flag}-crs has heights above {heights.datum}, and overrules the "
+                f"{self._path.name}: the stated CRS has heights above {heights.datum}, and overrules the "
                 f"datum of the file's {other.source}, {other.datum}."
             )
             self._remark("vertical-overrules", sentence)
@@ -256,8 +259,8 @@ class _Placing:
         self._remark(
             "vertical-disagrees",
             f"{self._path.name}: its {heights.source} state heights above {heights.datum}, its {other.source} "
-            f"{other.datum}. The header's WKT bit has the {heights.source} count; {self._flag}-vertical overrules "
-            "both.",
+            f"{other.datum}. The header's WKT bit has the {heights.source} count.",
+            f"{self._flag}-vertical overrules both.",
         )
 
     def _plan_scale(self, crs: PointCrs, plan: _Statement, unit: Unit | None) -> float:
@@ -267,16 +270,16 @@ class _Placing:
         if abs(unit.size / own - 1) < _NEARLY:
             raise InputError(
                 "cloud-units-disagree",
-                f"states coordinates in {unit.name} beside {plan.name}, which is in {crs.units[0]}. Give "
-                f"{self._flag}-crs {plan.name} if they are in {crs.units[0]}.",
+                f"states coordinates in {unit.name} beside {plan.name}, which is in {crs.units[0]}.",
                 path=self._path,
                 field=self._flag,
+                remedy=f"Give {self._flag}-crs {plan.name} if they are in {crs.units[0]}.",
             )
         self._remark(
             "map-unit",
             f"{self._path.name}: eastings and northings were converted from {unit.name}, which its {plan.source} "
-            f"state beside {plan.name}, a CRS in {crs.units[0]}. If they are in {crs.units[0]}: {self._flag}-crs "
-            f"{plan.name}.",
+            f"state beside {plan.name}, a CRS in {crs.units[0]}.",
+            f"If they are in {crs.units[0]}: {self._flag}-crs {plan.name}.",
         )
         return unit.size / own
 
@@ -290,9 +293,10 @@ class _Placing:
         if problem and heights is not self._option:
             raise InputError(
                 "height-unit-unknown",
-                f"states the unit of its heights by {problem}. Give {self._flag}-crs EPSG:n+m, in its unit.",
+                f"states the unit of its heights by {problem}.",
                 path=self._path,
                 field=self._flag,
+                remedy=f"Give {self._flag}-crs EPSG:n+m, in its unit.",
             )
         # The user's CRS states its unit. So does a datum in feet, where one in metres is the datum's usual name.
         by_user = heights is self._option and heights is not _NOTHING
@@ -331,12 +335,12 @@ def _of_text(text: str, source: str, *, path: Path | None = None, field: str | N
         problem = "a vertical CRS alone" if flat is None else f"a {flat.type_name} {flat.name!r}"
         return _Statement(source, vertical=upright, vertical_note=note, problem=problem)
     if not crs.is_compound:
-        return _of_whole(source, text, flat)
+        return _plain_statement(source, text, flat)
     horizontal = f"EPSG:{flat.to_epsg()}" if text.upper().startswith("EPSG:") else flat.to_wkt()
     return _Statement(source, horizontal, flat.name, text, upright, vertical_note=note)
 
 
-def _of_whole(source: str, text: str, crs: CRS) -> _Statement:
+def _plain_statement(source: str, text: str, crs: CRS) -> _Statement:
     """Return what the text of a CRS of two or three axes says that is not compound."""
     axes, name = (crs.source_crs or crs if crs.is_bound else crs).axis_info, _short_name(text, crs)
     if len(axes) < 3:
@@ -379,7 +383,7 @@ def _of_keys(said: FileCrs) -> _Statement:
         try:
             crs = proj_crs(text)
             if crs.is_geographic or crs.is_projected or crs.is_geocentric:
-                whole = _of_whole(_KEYS, text, crs)
+                whole = _plain_statement(_KEYS, text, crs)
                 if whole.is_ellipsoidal and vertical is None and not keys.is_ellipsoidal:
                     common |= {"is_ellipsoidal": True, "height_unit": keys.height_unit or whole.height_unit}
                     return replace(whole, **common)

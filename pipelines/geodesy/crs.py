@@ -30,7 +30,7 @@ from pyproj.exceptions import CRSError, ProjError
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.geodesy.crs_names import code_of_name, proposals
+from pipelines.geodesy.crs_names import code_of_name, nearest_crs
 from pipelines.geodesy.enu import ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.operations import Operation, OperationRequest, best_operation, proj_errors
 from pipelines.geodesy.plausible import ListedPoints, check_area, horizontal_of, rough_lon_lat
@@ -194,7 +194,7 @@ class PointCrs:
         except InputError as error:
             if error.code not in ("latitude-range", "longitude-range") or len(self.name) > _LONGEST_NAME:
                 raise
-            near = proposals(self.name, listed.points)
+            near = nearest_crs(self.name, listed.points)
             if not near:
                 raise
             message = f"{error.message} {self.name} is {self._crs.name}, whose coordinates are angles.{near}"
@@ -367,14 +367,15 @@ def _point_crs(crs: CRS, name: str, vertical: VerticalChoice | None) -> PointCrs
     return PointCrs(short, datum_of, False, unit[0], crs, unit[1], False)
 
 
-def _parse(name: str, refusal: Callable[[str, str], InputError]) -> CRS:
+def _parse(name: str, refusal: Callable[..., InputError]) -> CRS:
     if len(name) > _MAX_TEXT:
         raise refusal("crs-too-long", f"The text of a CRS has at most {_MAX_TEXT} characters, not {len(name)}.")
     file = file_in(name)
     if file is not None:
         raise refusal(
             "crs-opens-file",
-            f"{_short(file)!r} would open a file. Give EPSG:n, or a grid by its bare name in PROJ's own folders.",
+            f"{_short(file)!r} would open a file.",
+            remedy="Give EPSG:n, or a grid by its bare name in PROJ's own folders.",
         )
     utm = _UTM.fullmatch(name)
     if utm:
@@ -389,7 +390,7 @@ def _parse(name: str, refusal: Callable[[str, str], InputError]) -> CRS:
         code = code_of_name(name) if is_name else None
         if code is not None:
             return CRS.from_epsg(code)
-        near = proposals(name) if is_name else ""
+        near = nearest_crs(name) if is_name else ""
         raise refusal(
             "crs-unknown",
             f"PROJ knows no CRS {_short(name)!r}.{near} Give EPSG:n, EPSG:n+m, a PROJ string, WGS84 UTM 16N or "
@@ -433,8 +434,8 @@ def grid_from_enu(crs: PointCrs, lla: ArrayLike) -> FloatArray:
     if (np.linalg.det(rotations) < 0).any():
         raise InputError(
             "axes-left-handed",
-            f"The axes of {crs.name} are left-handed, and angles of cameras are not defined in them. Give a CRS "
-            "with easting and northing.",
+            f"The axes of {crs.name} are left-handed, and angles of cameras are not defined in them.",
+            remedy="Give a CRS with easting and northing.",
         )
     return rotations
 

@@ -47,7 +47,7 @@ def code_of_name(name: str) -> int | None:
     return names[0] if len(set(names)) == 1 else None
 
 
-def proposals(name: str, points: FloatArray | None = None) -> str:
+def nearest_crs(name: str, points: FloatArray | None = None) -> str:
     """Return a sentence with the systems that a name may mean, with a space before it; empty: nothing is near.
 
     With points (N, 3), easting first, those systems alone in whose area they lie.

@@ -147,15 +147,15 @@ def _no_operation(request: OperationRequest) -> InputError:
     if flat is not None and (flat.transformers or flat.unavailable_operations):
         return InputError(
             "geoid-unknown",
-            f"Heights above {request.crs.sub_crs_list[1].name} cannot be converted to ellipsoidal heights: PROJ "
-            "knows no geoid for them. "
-            "Give ellipsoidal heights, the horizontal CRS alone and --vertical ellipsoidal.",
+            (
+                f"Heights above {request.crs.sub_crs_list[1].name} cannot be converted to ellipsoidal heights: "
+                "PROJ knows no geoid for them."
+            ),
             path=request.path,
+            remedy="Give ellipsoidal heights, the horizontal CRS alone and --vertical ellipsoidal.",
         )
-    message = (
-        f"PROJ knows no transformation from {request.name} to WGS84. Name its datum (+datum=… or +towgs84=… in a "
-        "PROJ string), or give another CRS."
-    )
+    message = f"PROJ knows no transformation from {request.name} to WGS84."
+    remedy = "Name its datum (+datum=… or +towgs84=… in a PROJ string), or give another CRS."
     ellipsoid = horizontal.ellipsoid
     low, high = _MODERN_FLATTENING
     if (
@@ -166,8 +166,8 @@ def _no_operation(request: OperationRequest) -> InputError:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # "you will lose information": the datum, which is stated
             projection = horizontal.to_proj4().replace(" +no_defs", "").replace(" +type=crs", "")
-        message += f" If its datum is close enough to WGS84, give: {projection} +towgs84=0,0,0"
-    return InputError("no-transformation", message, path=request.path)
+        remedy += f" If its datum is close enough to WGS84, give: {projection} +towgs84=0,0,0"
+    return InputError("no-transformation", message, path=request.path, remedy=remedy)
 
 
 def _area(lon: FloatArray, lat: FloatArray) -> AreaOfInterest:

@@ -63,7 +63,10 @@ def parse_vertical(text: str) -> VerticalChoice:
     if match is None:
         known = ", ".join([ELLIPSOIDAL, *_EPSG_OF, "EPSG:n"])
         raise InputError(
-            "vertical-datum-unknown", f"{text!r} is no vertical datum. Give one of {known}.", field="--vertical"
+            "vertical-datum-unknown",
+            f"{text!r} is no vertical datum.",
+            field="--vertical",
+            remedy=f"Give one of {known}.",
         )
     epsg = int(match[1])
     return VerticalChoice(NAME_OF_EPSG.get(epsg, f"EPSG:{epsg}"), epsg)
@@ -87,8 +90,8 @@ def missing_grid_error(
     command = " ".join(["pyproj sync", *(f"--file {grid}" for grid in grids)])
     return InputError(
         "grid-not-installed",
-        f"{problem}: {files} not installed. Run `{command}`, or copy from https://cdn.proj.org into {folder}. "
-        f"{instead}",
+        f"{problem}: {files} not installed.",
+        remedy=f"Run `{command}`, or copy from https://cdn.proj.org into {folder}. {instead}",
         path=path,
     )
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import block_diag
 from scipy.sparse import bsr_matrix
 from scipy.special import exp1
 
@@ -32,7 +32,7 @@ from pipelines.geometry.statistics import CAUCHY_SCALE2, cauchy_weight, rayleigh
 def similarity_modes(cam_center_in_world: FloatArray) -> FloatArray:
     """Return the movements (n, 6, 7) of the cameras under an infinitesimal similarity about their mean centre.
 
-    Rows (δω, δc) as in `CorrectionBasis`, columns (ln s, rotation, translation).
+    Rows (δω, δc) as in `BundleInformation`, columns (ln s, rotation, translation).
     """
     arm = cam_center_in_world - cam_center_in_world.mean(axis=0)
     modes = np.zeros((len(arm), 6, 7))
@@ -65,9 +65,9 @@ class BundleInformation:
 
     The points are eliminated: the observations, which SfM has left at their minimum, cost
     ½ (x, ℓ)ᵀ [poses, cross; crossᵀ, lens] (x, ℓ).
-    Axes and signs of (δω, δc) are those of `CorrectionBasis`, the order of ℓ that of
-    `geometry.cameras.Lenses`. The points follow cameras and lens; `followed` is their mean similarity, weighted by
-    their information.
+    `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre. The
+    order of ℓ is that of `geometry.cameras.Lenses`. The points follow cameras and lens; `followed` is their mean
+    similarity, weighted by their information.
     """
 
     sums: EliminatedPoints  # the information
@@ -82,22 +82,6 @@ class BundleInformation:
         """Mean similarity (7, 6 n + L) of the points that follow cameras and lens."""
         cross = np.concatenate([self.sums.pose_modes, self.sums.lens_modes])
         return np.asarray(-np.linalg.solve(self.sums.modes, cross.T))
-
-    @cached_property
-    def lens_elimination(self) -> tuple[FloatArray, FloatArray]:
-        """How the lens follows the poses (L, 6 n), and its information about that (L, L).
-
-        Parameters that no observation reveals have rows of zeros.
-        """
-        diagonal = np.diag(self.sums.lens)
-        used = np.flatnonzero(diagonal > 0)  # shorter parameter lists leave empty columns
-        scale = 1.0 / np.sqrt(diagonal[used])
-        block = self.sums.lens[np.ix_(used, used)] * scale[:, None] * scale + 1e-9 * np.eye(len(used))
-        follows = np.zeros((len(diagonal), len(self.sums.cross)))
-        information = np.zeros_like(self.sums.lens)
-        follows[used] = -scale[:, None] * np.linalg.solve(block, (self.sums.cross[:, used] * scale).T)
-        information[np.ix_(used, used)] = block / scale[:, None] / scale
-        return follows, information
 
     def turned(self, new_from_old: Similarity, cam_center_in_new: FloatArray) -> BundleInformation:
         """Return the same information in another frame, whose cameras have centres (n, 3)."""
@@ -197,66 +181,3 @@ def shared_error_factor(network: Network, residual: FloatArray) -> float:
         if effect > 1.0 + _BY_CHANCE * (2.0 / free) ** 0.5:
             factor = max(factor, effect)
     return factor
-
-
-_COPIES = 4  # information, its factor, the basis, and a Jacobian or a normal matrix of the same size
-
-
-def predicted_basis_bytes(cameras: int) -> int:
-    """Return the peak of memory of a dense basis and of the normal equations in it."""
-    return _COPIES * 8 * (6 * cameras) ** 2
-
-
-@dataclass(frozen=True)
-class CorrectionBasis:
-    """Whitened corrections: (δω, δc) of all cameras = matrix @ z, with z ~ N(0, I) a posteriori.
-
-    A correction that costs the observations χ² = 1 has length one, and a similarity of the whole does not exist.
-
-    `δω` [rad] turns a camera about its centre, axes of the world: `R' = R Exp(−δω)`; `δc` [m] moves the centre.
-
-    The lens parameters correlate with the poses. Their error, (L,) in the order of `geometry.cameras.Lenses`, is
-    lens_matrix @ z plus an error that is independent of z.
-    """
-
-    matrix: FloatArray  # (n, 6, k), rows (δω, δc), k = 6 n − 7
-    lens_matrix: FloatArray  # (L, k)
-
-
-def correction_basis(bundle: BundleInformation, *, lens_follows: bool = True) -> CorrectionBasis:
-    """Return whitened, gauge-free coordinates of the camera corrections of a bundle at its minimum.
-
-    The points define the gauge. Under each correction the points follow the cameras and their lens; the mean
-    similarity of this movement, weighted by the information of each point, is zero.
-
-    The uncertainty of the similarity is therefore that of the scene, not that of the cameras' mean. A wrong focal
-    length or principal point shows as a common shift of the cameras against a scene that stays. That shift costs
-    the images little, and fixes reveal it. Cost O((6 n)³).
-
-    Unless the caller moves the lens by `lens_matrix` with the cameras (`lens_follows`), the lens is frozen, and the
-    points follow the cameras alone.
-    """
-    follows, _ = bundle.lens_elimination
-    root, complement = _root(bundle)
-    flat = solve_triangular(root, complement.T, lower=True).T * bundle.unit[:, None]
-    poses = len(bundle.unit)
-    through_lens = bundle.followed[:, poses:] @ follows if lens_follows else 0.0
-    held = flat - bundle.similarity_modes @ ((bundle.followed[:, :poses] + through_lens) @ flat)
-    return CorrectionBasis(held.reshape(-1, 6, flat.shape[1]), follows @ flat)
-
-
-def coordinates_of(bundle: BundleInformation, correction: FloatArray) -> FloatArray:
-    """Return the coordinates z (k,) of corrections (n, 6) in the basis; their common similarity is dropped."""
-    root, complement = _root(bundle)
-    return np.asarray(root.T @ (complement.T @ (correction.ravel() / bundle.unit)))
-
-
-def _root(bundle: BundleInformation) -> tuple[FloatArray, FloatArray]:
-    """Return the Cholesky root (k, k) of the information orthogonal to the similarities, and its axes (6 n, k)."""
-    follows, lens = bundle.lens_elimination
-    information = bundle.sums.poses.toarray() - follows.T @ lens @ follows
-    scaled = (information + information.T) / 2 * bundle.unit[:, None] * bundle.unit
-    complement = np.linalg.qr(bundle.similarity_modes / bundle.unit[:, None], mode="complete")[0][:, 7:]
-    reduced = complement.T @ scaled @ complement
-    reduced += np.eye(len(reduced)) / bundle.loosest_sigma_m**2
-    return np.asarray(np.linalg.cholesky(reduced)), complement

@@ -150,8 +150,9 @@ def parameter_names(camera: Camera) -> tuple[str, ...]:
     """
     listed = _PARAMETERS.get(camera.model)
     if listed is None:
-        message = f"The camera model {camera.model} is not supported. Use one of {', '.join(MODELS)}."
-        raise InputError("camera-model-unknown", message)
+        message = f"The camera model {camera.model} is not supported."
+        remedy = f"Use one of {', '.join(MODELS)}."
+        raise InputError("camera-model-unknown", message, remedy=remedy)
     names = tuple(listed.split())
     if len(camera.params) != len(names):
         message = f"The camera model {camera.model} has {len(names)} parameters, not {len(camera.params)}."

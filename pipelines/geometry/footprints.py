@@ -175,7 +175,7 @@ def rows_by_square(points: FloatArray, side_m: float) -> list[tuple[tuple[int, i
 
 def voxel_keys(points: FloatArray, side_m: float) -> IntArray:
     """Return a number (P,) for the voxel of each of P ≥ 1 points (P, 3), the same for points of one voxel."""
-    return _row_numbers(np.floor(points / side_m).astype(np.int64))
+    return row_numbers(np.floor(points / side_m).astype(np.int64))
 
 
 def first_of_voxels(points: FloatArray, side_m: float) -> IntArray:
@@ -203,10 +203,10 @@ def count_voxels(points: FloatArray, side_m: FloatArray) -> int:
 def _sized_voxel_keys(points: FloatArray, side_m: FloatArray) -> IntArray:
     level = np.round(np.log2(np.maximum(side_m, _SMALLEST_M)))
     voxel = np.floor(points / (2.0**level)[:, None])
-    return _row_numbers(np.column_stack([level, voxel]).astype(np.int64))
+    return row_numbers(np.column_stack([level, voxel]).astype(np.int64))
 
 
-def _row_numbers(rows: IntArray) -> IntArray:
+def row_numbers(rows: IntArray) -> IntArray:
     """Return a number (P,) for each of P ≥ 1 rows, the same for equal rows; numbers sort ten times as fast."""
     number = np.zeros(len(rows), dtype=np.int64)
     for column in (rows - rows.min(axis=0)).T:

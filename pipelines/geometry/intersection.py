@@ -11,22 +11,33 @@ weights and propagates Σ_X = J Σ_obs Jᵀ. Here every ray is whitened first:
 
 Rays are flat arrays sorted by point. The rays of a point are a run (a segment) of the arrays.
 
-`refined_points` moves the points of a bundle to where cameras that have changed now see them.
+`nearest_points` takes cameras and rays as they are, for marks that have been checked: point, covariance and
+derivatives. `intersection_jacobian` is the same to first order, by the unknowns of a bundle. `refined_points` moves
+the points of a bundle to where cameras that have changed now see them.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import bsr_matrix, csr_matrix
 
 from pipelines.core.machine import thread_count
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.cameras import project_each
-from pipelines.geometry.network import Network, chunks_of_points, projection_residuals
+from pipelines.geometry.network import (
+    Network,
+    chunks_of_points,
+    has_positive_depth,
+    lens_slots,
+    linearise_bundle,
+    projection_residuals,
+    with_positive_depths,
+)
 from pipelines.geometry.rotations import skew
 from pipelines.geometry.statistics import cauchy_loss, cauchy_weight, chi2_quantile, huber_weight
 
@@ -191,8 +202,8 @@ class _RayFit:
 
 def _fit_rays(bundle: _RayBundle, cameras: UncertainCameras) -> _RayFit:
     """Fit points by least squares, and robustly where a ray is out of its σ."""
-    across = np.eye(3) - bundle.direction[:, :, None] * bundle.direction[:, None, :]  # A = I − d dᵀ
-    position = _solve_points(bundle, across)  # eq. 9 with equal weights: near enough for the distances
+    # Eq. 9 with equal weights: near enough for the distances.
+    position = _solve_points(bundle, across_rays(bundle.direction))
     whitener, information = _whitener(bundle, cameras, position)
     fit = _RayFit(_solve_points(bundle, information), whitener, information, np.ones(len(bundle.owner), dtype=bool))
     squared = _squared_residuals(whitener, fit.position[bundle.owner] - bundle.center)
@@ -309,6 +320,120 @@ def _largest_angle_deg(bundle: _RayBundle, used: BoolArray) -> FloatArray:
             cosine = (run @ np.swapaxes(run, 1, 2)).min(axis=(1, 2))
             angle[part] = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     return angle
+
+
+@dataclass(frozen=True)
+class NearestPoints:
+    """J points and the K rays of exact cameras that determine them, with covariance and derivatives of the points.
+
+    A ray has the weight of its lateral variance at the point, (angular σ × distance)⁻².
+    """
+
+    position: FloatArray  # (J, 3), in the frame of the rays
+    point: IntArray  # (K,) index into the points
+    center: FloatArray  # (K, 3) projection centre
+    direction: FloatArray  # (K, 3) unit
+    sigma_rad: FloatArray  # (K,) angular σ
+
+    @property
+    def weight(self) -> FloatArray:
+        distance = np.linalg.norm(self.position[self.point] - self.center, axis=1)
+        return np.asarray(1.0 / (self.sigma_rad * distance) ** 2)
+
+    @cached_property
+    def cov(self) -> FloatArray:
+        """Covariance (J, 3, 3) of the points from the σ of the rays."""
+        normal = np.zeros((len(self.position), 3, 3))
+        np.add.at(normal, self.point, self.weight[:, None, None] * across_rays(self.direction))
+        return np.asarray(np.linalg.solve(normal, np.eye(3)))
+
+    def derivatives(self) -> tuple[FloatArray, FloatArray]:
+        """Return the derivatives (K, 3, 3) of each ray's point by the ray's centre and by its direction.
+
+        N dx = Σ w (P dc − dP (x − c)), and −dP (x − c) = (ρ I + d eᵀ) dd with x − c = ρ d + e.
+        """
+        arm = self.position[self.point] - self.center
+        along = np.einsum("ki,ki->k", self.direction, arm)
+        across = arm - along[:, None] * self.direction
+        response = self.cov[self.point] * self.weight[:, None, None]
+        turned = along[:, None, None] * np.eye(3) + self.direction[:, :, None] * across[:, None, :]
+        return response @ across_rays(self.direction), response @ turned
+
+
+def nearest_points(
+    point: IntArray, center: FloatArray, direction: FloatArray, sigma_rad: FloatArray, count: int
+) -> NearestPoints:
+    """Return the J = `count` points nearest to their rays (K,), weighted as in `NearestPoints` (eqs 4–9)."""
+    across, weight = across_rays(direction), np.asarray(1.0 / sigma_rad**2)
+    found = NearestPoints(np.zeros((count, 3)), point, center, direction, sigma_rad)
+    for _ in range(2):  # the first pass gives the distances, and so the weights
+        found = replace(found, position=meeting_points(point, center, across, count, weight=weight))
+        weight = found.weight
+    return found
+
+
+def meeting_points(
+    point: IntArray,
+    center: FloatArray,
+    across: FloatArray,
+    count: int,
+    *,
+    weight: FloatArray | None = None,
+    ridge: float = 0.0,
+) -> FloatArray:
+    """Return the least-squares points (J, 3) of rays (K,) with `across_rays` (K, 3, 3): Σ w P x = Σ w P c (eq. 9).
+
+    With a `ridge` on the diagonal, parallel rays do not raise.
+    """
+    weight = np.ones(len(point)) if weight is None else weight
+    normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    np.add.at(normal, point, weight[:, None, None] * across)
+    np.add.at(right, point, weight[:, None] * np.einsum("kij,kj->ki", across, center))
+    return np.asarray(np.linalg.solve(normal + ridge * np.eye(3), right[:, :, None])[:, :, 0])
+
+
+def across_rays(direction: FloatArray) -> FloatArray:
+    """Return the projections P = I − d dᵀ (K, 3, 3) across rays with unit vectors d."""
+    return np.asarray(np.eye(3) - direction[:, :, None] * direction[:, None, :])
+
+
+@dataclass(frozen=True)
+class IntersectionJacobian:
+    """Effect of poses, lens and marks on N intersected points, to first order."""
+
+    # (3 N, 6 n) sparse, metres by (δω, δc) of each camera as in `geometry.bundle.BundleInformation`
+    by_poses: csr_matrix
+    by_lens: (
+        FloatArray  # (N, 3, L) metres by the lens parameters, in the order of `geometry.bundle.BundleInformation`
+    )
+    # (N, 3, 3) m², from the σ of the marks; NaN for a point that its rays do not determine
+    cov_of_marks: FloatArray
+
+
+def intersection_jacobian(
+    marks: Network, sigma_px: FloatArray, surveyed: FloatArray | None = None
+) -> IntersectionJacobian:
+    """Return the derivatives by poses and lens of the points of a network, each intersected from its own marks.
+
+    The derivatives are taken at the projections of the points; of the marks their σ (M,) enter, and not the pixels.
+    Marks of points behind their camera do not count. Points may have information (N, 3, 3) beyond these, in 1/m².
+    """
+    sigma_px, marks = sigma_px[has_positive_depth(marks)], with_positive_depths(marks)
+    lin, count = linearise_bundle(marks), len(marks.point_in_world)
+    weighted = np.swapaxes(lin.jacobian_point, 1, 2) / (sigma_px**2)[:, None, None]
+    normal = np.zeros((count, 3, 3)) if surveyed is None else surveyed.copy()
+    np.add.at(normal, marks.obs_point, weighted @ lin.jacobian_point)
+    value, vector = np.linalg.eigh(normal)
+    value[value[:, 0] <= 1e-9 * value[:, 2]] = np.nan
+    cov = (vector / value[:, None, :]) @ np.swapaxes(vector, 1, 2)
+    response = -cov[marks.obs_point] @ weighted  # (M, 3, 2) metres per pixel
+    lens = np.zeros((count, len(marks.cameras), 3, lin.jacobian_intrinsics.shape[2]))
+    np.add.at(lens, (marks.obs_point, lens_slots(marks)), response @ lin.jacobian_intrinsics)
+    order = np.argsort(marks.obs_point, kind="stable")
+    first = np.searchsorted(marks.obs_point[order], np.arange(count + 1))
+    blocks = ((response @ lin.jacobian_pose)[order], marks.obs_image[order], first)
+    poses = bsr_matrix(blocks, shape=(3 * count, 6 * len(marks.camera_id)))
+    return IntersectionJacobian(csr_matrix(poses), np.swapaxes(lens, 1, 2).reshape(count, 3, -1), cov)
 
 
 _STEPS = 4

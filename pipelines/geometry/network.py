@@ -48,7 +48,7 @@ class Network:
 class LinearisedBundle:
     """Jacobians of M observations in pixels."""
 
-    jacobian_pose: FloatArray  # (M, 2, 6), by (δω, δc) of the camera, as in `CorrectionBasis`
+    jacobian_pose: FloatArray  # (M, 2, 6), by (δω, δc) of the camera, as in `geometry.bundle.BundleInformation`
     jacobian_point: FloatArray  # (M, 2, 3)
     jacobian_intrinsics: FloatArray  # (M, 2, P), P the longest parameter list; zero beyond a shorter one
 

@@ -47,6 +47,14 @@ class Pivot:
     below: FloatArray  # (b, o)
 
 
+_FILL_BYTES = 12_000  # of blocks over a plane whose photographs overlap by 80 %: see `predicted_factor_bytes`
+
+
+def predicted_factor_bytes(cameras: int) -> int:
+    """Return the memory of a factor of cameras, each coupled with 75 neighbours in the plane, or with all."""
+    return min(8 * (6 * cameras) ** 2, int(_FILL_BYTES * cameras * np.log2(max(cameras, 2))))
+
+
 _solved = partial(solve_triangular, lower=True, check_finite=False)
 
 
@@ -66,12 +74,16 @@ class SparseCholesky:
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return the product (n · w, m) of the inverse matrix and vectors (n · w, m)."""
+        return self.coloured(self.whitened(right))
+
+    def whitened(self, right: FloatArray) -> FloatArray:
+        """Return the product L⁻¹ right (n · w, m) of vectors (n · w, m) with the inverse of the factor L."""
         solution = np.array(right, dtype=np.float64, order="C")
         for pivot in self.pivots:
             own = _solved(pivot.diagonal, solution[pivot.own])
             solution[pivot.own] = own
             solution[pivot.border] -= pivot.below @ own
-        return self.coloured(solution)
+        return solution
 
     def coloured(self, white: FloatArray) -> FloatArray:
         """Return vectors (n · w, m) with the inverse matrix as their covariance, from white noise (n · w, m)."""
@@ -80,6 +92,27 @@ class SparseCholesky:
             own = solution[pivot.own] - pivot.below.T @ solution[pivot.border]
             solution[pivot.own] = _solved(pivot.diagonal, own, trans=1)
         return solution
+
+    def path(self, place: int) -> list[int]:
+        """Return the pivots of which a place of L⁻ᵀ w depends: that of the place, and those above it, upwards."""
+        path = [int(self._front_of[place])]
+        while self._parent[path[-1]] >= 0:
+            path.append(int(self._parent[path[-1]]))
+        return path
+
+    @cached_property
+    def _front_of(self) -> IntArray:
+        front_of = np.zeros(sum(len(front.own) for front in self._fronts), dtype=np.int64)
+        for index, front in enumerate(self._fronts):
+            front_of[front.own] = index
+        return front_of
+
+    @cached_property
+    def _parent(self) -> IntArray:
+        parent = np.full(len(self._fronts), -1, dtype=np.int64)
+        for index, front in enumerate(self._fronts):
+            parent[list(front.children)] = index
+        return parent
 
     def inverse_form(self, right: csc_matrix) -> FloatArray:
         """Return the symmetric product rightᵀ A⁻¹ right (m, m) of a sparse matrix (n · w, m).

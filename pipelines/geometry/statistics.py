@@ -122,6 +122,11 @@ def squared_mahalanobis(residuals: ArrayLike, covariances: ArrayLike) -> FloatAr
     return np.asarray((r * solved).sum(axis=-1))
 
 
+def root_information(covariances: ArrayLike) -> FloatArray:
+    """Return W (…, d, d) with WᵀW = Σ⁻¹, which whitens residuals of covariances Σ (…, d, d)."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(np.asarray(covariances, dtype=np.float64))))
+
+
 def typical_sigma(covariances: ArrayLike) -> float:
     """Return the typical σ per axis of covariances (N, 3, 3)."""
     return float(np.sqrt(np.median(np.trace(np.asarray(covariances), axis1=1, axis2=2)) / 3))

@@ -4,6 +4,7 @@ The navigation is on one clock: positions Earth-centred, attitudes against north
 body at each photograph is by the options, else by `/tf`.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Rig, Trajectory, frame_from_frd
 from pipelines.ingest.bag_messages import BASE, GEODETIC_HEIGHTS, IMPOSSIBLE_HEIGHT
 from pipelines.ingest.bag_photos import lens_priors, write_photos
+from pipelines.ingest.bag_rig import cameras_beside, photographs_beside, sensor_name
 from pipelines.ingest.bag_streams import BagStreams, TopicSamples, read_streams
 from pipelines.ingest.flight_record import (
     RECEIVERS,
@@ -34,7 +36,7 @@ from pipelines.ingest.flight_record import (
     require_enough,
     with_defaults,
 )
-from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.options import ALL_SENSORS, IngestOptions
 from pipelines.ingest.remarks import Remarks
 
 _MANY_FRAMES = 1000
@@ -51,18 +53,27 @@ def read_bag(
     """
     with open_bag(path) as bag:
         streams = read_streams(bag, options, remarks, progress)
+        beside = cameras_beside(streams, remarks) if options.sensor == ALL_SENSORS else ()
         positions, vertical = _positions(streams, options, remarks)
-        place = positions.at(streams.images.time_s + options.time_offset_s).position
+        place = positions.at(streams.camera.images.time_s + options.time_offset_s).position
         photos, numbers = write_photos(
-            bag, streams.images, place, options=options, folder=folder, remarks=remarks, progress=progress
+            bag, streams.camera.images, place, options=options, folder=folder, remarks=remarks, progress=progress
         )
-    if len(photos) > _MANY_FRAMES and options.every is None:
-        remarks.warn(
-            "all-frames-taken", f"All {len(photos)} frames were taken. --every 2s or --every 5m takes fewer."
-        )
-    require_enough(len(photos), path, "--bag", remarks)
-    cameras, camera_of = lens_priors(photos, streams, options, remarks)
-    time_s = streams.images.time_s[numbers]
+        if len(photos) > _MANY_FRAMES and options.every is None:
+            remarks.warn(
+                "all-frames-taken", f"All {len(photos)} frames were taken.", "--every 2s or --every 5m takes fewer."
+            )
+        require_enough(len(photos), path, "--bag", remarks)
+        cameras, camera_of = lens_priors(photos, streams.camera, options, remarks)
+        if beside:
+            name = sensor_name(streams.camera.images.topic)
+            photos = [replace(photo, sensor=name) for photo in photos]
+            cameras = tuple(camera.model_copy(update={"sensor": name}) for camera in cameras)
+        rig = photographs_beside(
+            bag, beside, dict(zip(numbers, photos, strict=True)), known=len(cameras),
+            options=options, folder=folder, remarks=remarks, progress=progress,
+        )  # fmt: skip
+    time_s = streams.camera.images.time_s[numbers]
     attitudes = _attitudes(streams, options)
     recorded = RecordedNavigation(
         positions=positions,
@@ -76,7 +87,16 @@ def read_bag(
     receivers = [] if streams.positions is None else streams.positions.receivers
     worst = max(receivers, key=RECEIVERS.index, default=RECEIVERS[-1])
     poses = _poses(recorded, worst, vertical, options, remarks)
-    return FlightRecord(folder.resolve(), photos, cameras, camera_of, poses, recorded)
+    return FlightRecord(
+        folder.resolve(),
+        photos,
+        (*cameras, *rig.cameras),
+        {**camera_of, **rig.camera_of},
+        poses,
+        recorded,
+        rig.accompanying,
+        rig.rotations,
+    )
 
 
 def count_frames(
@@ -88,7 +108,9 @@ def count_frames(
     """
     with open_bag(path) as bag:
         streams = read_streams(bag, options, remarks, progress)
-    images, (positions, _) = streams.images, _positions(streams, options, remarks)
+    if options.sensor == ALL_SENSORS:
+        cameras_beside(streams, remarks)
+    images, (positions, _) = streams.camera.images, _positions(streams, options, remarks)
     located = complete(positions.at(images.time_s + options.time_offset_s).position) & images.usable
     count = int(images.usable.sum())
     require_enough(count, path, "--bag", remarks)
@@ -111,20 +133,22 @@ def _positions(streams: BagStreams, options: IngestOptions, remarks: Remarks) ->
     elif options.origin is None:
         raise InputError(
             "local-frame-without-origin",
-            f"{series.topic} has positions in the local frame {series.world!r}, whose place on Earth is unknown. "
-            "Give its zero with --origin LAT,LON,HEIGHT (its axes are taken as East-North-Up), or a topic with "
-            "latitude and longitude with --fix-topic.",
+            (f"{series.topic} has positions in the local frame {series.world!r}, whose place on Earth is unknown."),
             path=streams.path,
             field="--origin",
+            remedy=(
+                "Give its zero with --origin LAT,LON,HEIGHT (its axes are taken as East-North-Up), or a topic "
+                "with latitude and longitude with --fix-topic."
+            ),
         )
     else:
         lat_deg, lon_deg, alt_m = options.origin
         position_in_ecef = ecef_from_enu(values[:, :3], Origin(lat_deg=lat_deg, lon_deg=lon_deg, alt_m=alt_m))
-        note = "height of --origin taken as ellipsoidal"
+        note = "height of the given origin taken as ellipsoidal"
         vertical = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=note)
         remarks.assume(
             "local-frame-axes",
-            f"The frame {series.world!r} of {series.topic} is East-North-Up, with its zero at --origin.",
+            f"The frame {series.world!r} of {series.topic} is East-North-Up, with its zero at the given origin.",
         )
     positions = Trajectory.from_samples(
         series.time_s[series.usable],
@@ -141,7 +165,8 @@ def _geodetic(series: TopicSamples, options: IngestOptions, remarks: Remarks) ->
     if options.vertical is None:
         remarks.assume(
             "bag-heights",
-            f"Heights of {series.topic} are {heights}. If its driver writes others, state them with --vertical.",
+            f"Heights of {series.topic} are {heights}.",
+            "If its driver writes others, state them with --vertical.",
         )
     by_definition = VerticalDatum(name=ELLIPSOIDAL, stated=False, note=heights, by_definition=True)
     lla = crs.lla_from_xyz(series.table()[:, [1, 0, 2]])
@@ -171,7 +196,7 @@ def _rig_at(time_s: FloatArray, attitudes: Trajectory, streams: BagStreams, give
         )
         return Rig(mounts, arms, given.nominal_from_cam)
     frames, body, axes = streams.transforms, streams.attitudes.frame, streams.attitudes.axes
-    image_frame, from_frd = streams.images.frame, frame_from_frd(axes)
+    image_frame, from_frd = streams.camera.images.frame, frame_from_frd(axes)
     if body not in frames and BASE in frames and axes == "flu":
         remarks.assume(
             "attitude-frame", f"/tf lacks the frame {body!r} of the attitudes, which is taken as {BASE}."
@@ -191,7 +216,8 @@ def _rig_at(time_s: FloatArray, attitudes: Trajectory, streams: BagStreams, give
         remarks.warn(
             "camera-mount-unknown",
             f"/tf does not link the frames {image_frame!r} of the camera and {body!r} of the attitudes, so that "
-            "the cameras have no attitude. Give --camera-mount YAW,PITCH,ROLL.",
+            "the cameras have no attitude.",
+            "Give --camera-mount YAW,PITCH,ROLL.",
         )
     if given.antenna_in_body is None:
         antenna = frames.between(body, streams.positions.frame, time_s) if streams.positions else None
@@ -200,8 +226,8 @@ def _rig_at(time_s: FloatArray, attitudes: Trajectory, streams: BagStreams, give
         else:
             remarks.assume(
                 "lever-arm-unknown",
-                "The lever arm is unknown: positions of the antenna are taken as those of the camera. State it "
-                "with --lever-arm.",
+                "The lever arm is unknown: positions of the antenna are taken as those of the camera.",
+                "State it with --lever-arm.",
             )
     return Rig(mounts, arms, given.nominal_from_cam)
 
@@ -217,7 +243,8 @@ def _poses(
     remarks.warn_counted(
         "images-without-position",
         [stamps[row] for row in np.flatnonzero(~complete(antenna.position))],
-        f"Frames have no position within --max-gap {recorded.positions.max_gap_s:g} s",
+        f"Frames have no position within {recorded.positions.max_gap_s:g} s",
+        "--max-gap sets that limit.",
     )
     position_in_ecef, enu_from_cam = camera_poses(antenna.position, body.rotation, recorded.rig, stamps, remarks)
     receivers, located = (receiver,) * len(time_s), complete(position_in_ecef)

@@ -95,7 +95,7 @@ def inspect_bag(path: Path, progress: Progress = SILENT) -> BagReport:
         )
         missing = _missing(bag, topics, tallies, transforms)
         count = sum(len(tally.times) for tally in tallies.values())
-        remarks = (*(note.sentence for note in bag.notes), *topics.remarks, *_clock_remarks(topics, tallies))
+        remarks = (*(note.text for note in (*bag.notes, *topics.remarks)), *_clock_remarks(topics, tallies))
         return BagReport(str(path), count, reports, remarks, missing)
 
 
@@ -107,7 +107,7 @@ def _clock_remarks(topics: SelectedTopics, tallies: dict[str, _Tally]) -> list[s
             np.array(each, dtype=np.int64) for each in (tallies[topic].times, tallies[topic].recorded)
         )
         raw[topic] = (times if tallies[topic].stamped else np.zeros_like(times)), recorded
-    return [shift.sentence for shift in clock_shifts_of(raw).values()]
+    return [shift.remark.text for shift in clock_shifts_of(raw).values()]
 
 
 def _count(bag: Bag, message: RawMessage, tally: _Tally, transforms: Transforms) -> None:

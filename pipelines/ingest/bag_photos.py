@@ -1,7 +1,7 @@
 """Photographs from a bag: the selected frames, written as files one at a time, and their lens."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +10,10 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray
-from pipelines.formats.bag import BadImageError, Bag, ImageWriter, UndecodableError
+from pipelines.formats.bag import BadImageError, Bag, ImageWriter, RawMessage, UndecodableError
 from pipelines.formats.exif import PhotoTags
-from pipelines.formats.image_file import MAX_PIXELS, inspect_image
-from pipelines.ingest.bag_streams import BagStreams, TopicSamples
+from pipelines.formats.image_file import MAX_PIXELS, ImageFile, inspect_image
+from pipelines.ingest.bag_streams import CameraStream, TopicSamples
 from pipelines.ingest.options import Every, IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors
 from pipelines.ingest.remarks import Remarks
@@ -55,13 +55,11 @@ def write_photos(
             last = numbers[-1] if numbers else None
             if options.every is not None and not _is_due(options.every, images.time_s, place, last, number):
                 continue
-            try:
-                data, suffix = writer.encoded(message.type, bag.decode(message))
-                name = f"frame_{number:06d}{suffix}"
-                file = inspect_image(data, Path(name))
-            except (UndecodableError, BadImageError, InputError) as error:
-                failed.append(f"message {number} ({str(error)[:120]})")
+            picture = _picture(writer, bag, message, number)
+            if isinstance(picture, str):
+                failed.append(picture)
                 continue
+            name, data, file = picture
             if options.skip_blurred and _is_blurred(file.sharpness, recent):
                 blurred += 1
                 continue
@@ -72,16 +70,65 @@ def write_photos(
             (folder / name).write_bytes(data)
             photos.append(Photo(name, file, PhotoTags(timestamp_s=float(images.time_s[number]))))
             numbers.append(number)
-    remarks.warn_counted("image-unreadable", failed, f"Images of {topic} cannot be read and are left out")
+    _note_pictures(topic, failed, writer, remarks)
     if blurred:
-        remarks.warn("blurred-frames", f"{blurred} frames are blurred and are left out (--skip-blurred).")
+        remarks.warn(
+            "blurred-frames", f"{blurred} frames are blurred and are left out.", "--skip-blurred drops them."
+        )
     if copies:
         remarks.warn("image-copies", f"{copies} frames are copies of earlier ones and are left out.")
+    return photos, numbers
+
+
+def write_messages(
+    bag: Bag,
+    images: TopicSamples,
+    numbers: Collection[int],
+    *,
+    folder: Path,
+    within: str,
+    remarks: Remarks,
+    progress: Progress = SILENT,
+) -> list[tuple[Photo, int]]:
+    """Write pictures of a topic, by the numbers of their messages, into the folder `within` of `folder`.
+
+    Returned are the photographs, each with its number.
+    """
+    (folder / within).mkdir(parents=True, exist_ok=True)
+    writer, photos, failed = ImageWriter(), [], []
+    with progress.task(f"photographs, {within}", len(images.time_s)) as task:
+        for number, message in enumerate(bag.messages([images.topic])):
+            task.advance()
+            if number not in numbers:
+                continue
+            picture = _picture(writer, bag, message, number)
+            if isinstance(picture, str):
+                failed.append(picture)
+                continue
+            name, data, file = picture
+            (folder / within / name).write_bytes(data)
+            tags = PhotoTags(timestamp_s=float(images.time_s[number]))
+            photos.append((Photo(f"{within}/{name}", file, tags), number))
+    _note_pictures(images.topic, failed, writer, remarks)
+    return photos
+
+
+def _picture(writer: ImageWriter, bag: Bag, message: RawMessage, number: int) -> tuple[str, bytes, ImageFile] | str:
+    """Return name, bytes and head of the file of a message, or the reason why it is none."""
+    try:
+        data, suffix = writer.encoded(message.type, bag.decode(message))
+        name = f"frame_{number:06d}{suffix}"
+        return name, data, inspect_image(data, Path(name))
+    except (UndecodableError, BadImageError, InputError) as error:
+        return f"message {number} ({str(error)[:120]})"
+
+
+def _note_pictures(topic: str, failed: Sequence[str], writer: ImageWriter, remarks: Remarks) -> None:
+    remarks.warn_counted("image-unreadable", failed, f"Images of {topic} cannot be read and are left out")
     if writer.bits is not None:
         remarks.assume(
             "image-bit-depth", f"16-bit images of {topic} use {writer.bits} bits, as the first one does."
         )
-    return photos, numbers
 
 
 def _is_due(every: Every, time_s: FloatArray, place: FloatArray, last: int | None, number: int) -> bool:
@@ -101,17 +148,17 @@ def _is_blurred(current: float, recent: deque[float]) -> bool:
 
 
 def lens_priors(
-    photos: Sequence[Photo], streams: BagStreams, options: IngestOptions, remarks: Remarks
+    photos: Sequence[Photo], camera: CameraStream, options: IngestOptions, remarks: Remarks
 ) -> tuple[tuple[CameraPrior, ...], dict[str, int]]:
     """Return one calibrated camera of all photographs, or else assumed ones; and each photograph's camera id.
 
     A topic with `rect` in its last part or `_rect` anywhere is rectified. `--focal-px` overrides `CameraInfo`.
     """
     sizes = {(photo.file.width, photo.file.height) for photo in photos}
-    if streams.info is None or options.focal_px is not None or len(sizes) != 1:
+    if camera.info is None or options.focal_px is not None or len(sizes) != 1:
         return camera_priors(photos, options.focal_px, remarks)
-    topic = streams.images.topic
-    prior, remark = _camera_prior(streams.info, "rect" in topic.rpartition("/")[2] or "_rect" in topic)
+    topic = camera.images.topic
+    prior, remark = _camera_prior(camera.info, "rect" in topic.rpartition("/")[2] or "_rect" in topic)
     (width, height) = next(iter(sizes))
     fitted = _scaled_prior(prior, width, height) if prior is not None else None
     if prior is not None and fitted is None:
@@ -119,7 +166,7 @@ def lens_priors(
     if fitted is None:
         remarks.warn("camera-info-unused", f"{remark}. It is not used.")
         return camera_priors(photos, options.focal_px, remarks)
-    remarks.assume("lens-from-camera-info", f"The lens is from {streams.info_topic}: {remark}.")
+    remarks.assume("lens-from-camera-info", f"The lens is from {camera.info_topic}: {remark}.")
     return (fitted,), {photo.name: 1 for photo in photos}
 
 

@@ -5,6 +5,7 @@ Photographs pass by undecoded here, so that memory does not grow with them.
 
 from __future__ import annotations
 
+import re
 from array import array
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping
@@ -15,17 +16,20 @@ from typing import Any
 import numpy as np
 
 from pipelines.core.errors import InputError
+from pipelines.core.products import Remark
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.formats.bag import COMPRESSED, IMAGE, INFO, Bag, BagTopic, RawMessage, UndecodableError
-from pipelines.ingest.bag_clocks import ClockShift, clock_shifts
 from pipelines.ingest.bag_messages import ATTITUDES, POSITIONS, TRANSFORM_TYPES, Axes, Transforms, stamp_ns
-from pipelines.ingest.bag_receivers import RECEIVER_TYPES, ranked_receivers
-from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.remarks import Remarks
+from pipelines.ingest.bag_sources import RECEIVER_TYPES, TOPIC_CHOICE, ClockShift, clock_shifts, ranked_receivers
+from pipelines.ingest.options import ALL_SENSORS, IngestOptions
+from pipelines.ingest.remarks import Remarks, add
 
 # Pictures that are no photographs.
 _NOT_PHOTOS = ("depth", "disparity", "mask", "confidence", "segmentation", "thermal", "theora")
+_TRANSPORTS = ("compressed", "theora", "ffmpeg", "zstd")  # last parts of topics, of `image_transport`
+_ANY_IMAGE = re.compile(r"image([-_]?(raw|colou?r|mono|gr[ae]y|rgb|bgr|rect(ified)?|resized|proc|bayer))*")
+UNNAMED_FRAME = "camera"  # stands for the frame of a camera whose driver states none
 _DAY_NS = 86_400_000_000_000
 # Notes of a bag that change nothing of what is read.
 _HARMLESS_NOTES = ("bag-qos-differs",)
@@ -37,15 +41,17 @@ _JUMP_NS = 60_000_000_000
 class SelectedTopics:
     """The topics to read, None where the bag has none; `remarks` names those that were not selected.
 
-    `receivers_apart`: the sentence on two receivers that are further apart than their σ; empty: none are.
+    `others` are image and lens topics of the other cameras, one of each, where all are asked for.
+    `receivers_apart`: the caution of two receivers that are further apart than their σ; None: none are.
     """
 
     image: str | None
     info: str | None
     fix: str | None
     attitude: str | None
-    remarks: tuple[str, ...]
-    receivers_apart: str = ""
+    remarks: tuple[Remark, ...]
+    others: tuple[tuple[str, str | None], ...] = ()
+    receivers_apart: Remark | None = None
 
 
 def select_topics(bag: Bag, options: IngestOptions) -> SelectedTopics:
@@ -54,16 +60,24 @@ def select_topics(bag: Bag, options: IngestOptions) -> SelectedTopics:
     Images: names that tell of depth, masks and the like come last, then topics with a `CameraInfo` beside them
     first, then those with more messages. Positions and attitudes: by the order of types in `bag_messages`
     (receivers before estimators before local frames), then those with more messages; of several receivers the
-    better one, as `bag_receivers` has it. Attitudes only where the first message has one. Equals go by name.
+    better one, as `bag_sources` has it. Attitudes only where the first message has one. Equals go by name.
 
     Raises:
         InputError: a named topic is not there, or is of no type that fits.
     """
-    remarks: list[str] = []
-    apart = ""
+    remarks: list[Remark] = []
+    apart: Remark | None = None
+    choice: Remark | None = None
     images = sorted(_of(bag, (IMAGE, COMPRESSED)), key=lambda topic: _image_rank(bag, topic))
-    image = _pick(bag, images, options.image_topic, flag="--image-topic", subject="photographs", remarks=remarks)
-    fixes, choice = _by_type(bag, POSITIONS), ""
+    image = _pick(
+        bag, images, options.image_topic, flag="--image-topic", subject="photographs", remarks=remarks,
+        choice=_choice_of_camera(images),
+    )  # fmt: skip
+    others: tuple[tuple[str, str | None], ...] = ()
+    if options.sensor == ALL_SENSORS and image is not None:
+        remarks = []  # the other topics are not passed over
+        others = _other_cameras(bag, images, image)
+    fixes = _by_type(bag, POSITIONS)
     receivers = [topic for topic in fixes if topic.type in RECEIVER_TYPES]
     if options.fix_topic is None and len(receivers) > 1:
         receivers, choice, apart = ranked_receivers(bag, receivers)
@@ -77,7 +91,43 @@ def select_topics(bag: Bag, options: IngestOptions) -> SelectedTopics:
     attitude = _pick(
         bag, attitudes, options.attitude_topic, flag="--attitude-topic", subject="attitudes", remarks=remarks
     )
-    return SelectedTopics(image, _info_topic(bag, image), fix, attitude, tuple(remarks), apart)
+    return SelectedTopics(image, _info_topic(bag, image), fix, attitude, tuple(remarks), others, apart)
+
+
+def camera_of_topic(topic: str) -> str:
+    """Return what topics of one camera have in common: their namespace, else the name without the transport.
+
+    `/left/image_raw`, `/left/image_raw/compressed` and `/left/image_rect` are of `/left`; `/image_left` is its own.
+    """
+    parts = topic.split("/")
+    if parts[-1] in _TRANSPORTS and len(parts) > 2:
+        parts = parts[:-1]
+    if _ANY_IMAGE.fullmatch(parts[-1]) and len(parts) > 2:
+        parts = parts[:-1]
+    return "/".join(parts)
+
+
+def _choice_of_camera(images: list[BagTopic]) -> Remark | None:
+    """Return the remark on topics of several cameras, which may be a rig; None: they are of one."""
+    photos = [topic.name for topic in images if not _is_no_photo(topic)]
+    if len({camera_of_topic(name) for name in photos}) < 2:
+        return None
+    first, *rest = (topic.name for topic in images)
+    return Remark(
+        code=TOPIC_CHOICE,
+        sentence=f"The photographs are from {first}, not {', '.join(rest[:4])}.",
+        remedy="--image-topic selects another topic, and --sensor all takes cameras that expose together as a rig.",
+    )
+
+
+def _other_cameras(bag: Bag, images: list[BagTopic], chosen: str) -> tuple[tuple[str, str | None], ...]:
+    """Return the first image topic of each other camera, and its `CameraInfo`."""
+    found: dict[str, tuple[str, str | None]] = {}
+    for topic in images:
+        camera = camera_of_topic(topic.name)
+        if not _is_no_photo(topic) and camera != camera_of_topic(chosen):
+            found.setdefault(camera, (topic.name, _info_beside(bag, topic.name)))
+    return tuple(found.values())
 
 
 def _of(bag: Bag, types: Container[str]) -> list[BagTopic]:
@@ -92,20 +142,25 @@ def _by_type(bag: Bag, types: Iterable[str]) -> list[BagTopic]:
 def _info_topic(bag: Bag, image: str | None) -> str | None:
     """Return the `CameraInfo` of an image topic: in its namespace, or the only one."""
     infos = _of(bag, (INFO,))
-    if image is not None:
-        parts = image.split("/")
-        for depth in range(len(parts) - 1, 1, -1):
-            beside = "/".join([*parts[:depth], "camera_info"])
-            if any(topic.name == beside for topic in infos):
-                return beside
-    return infos[0].name if len(infos) == 1 else None
+    beside = None if image is None else _info_beside(bag, image)
+    return beside or (infos[0].name if len(infos) == 1 else None)
+
+
+def _info_beside(bag: Bag, image: str) -> str | None:
+    infos = {topic.name for topic in _of(bag, (INFO,))}
+    parts = image.split("/")
+    names = ("/".join([*parts[:depth], "camera_info"]) for depth in range(len(parts) - 1, 1, -1))
+    return next((name for name in names if name in infos), None)
+
+
+def _is_no_photo(topic: BagTopic) -> bool:
+    return any(word in topic.name.lower() for word in _NOT_PHOTOS)
 
 
 def _image_rank(bag: Bag, topic: BagTopic) -> tuple[bool, bool, int, str]:
-    name = topic.name.lower()
     beside = _info_topic(bag, topic.name)
     near = beside is not None and topic.name.startswith(beside.removesuffix("camera_info"))
-    return any(word in name for word in _NOT_PHOTOS), not near, -topic.count, topic.name
+    return _is_no_photo(topic), not near, -topic.count, topic.name
 
 
 def _has_attitude(bag: Bag, topic: BagTopic) -> bool:
@@ -120,8 +175,8 @@ def _pick(
     *,
     flag: str,
     subject: str,
-    remarks: list[str],
-    choice: str = "",
+    remarks: list[Remark],
+    choice: Remark | None = None,
 ) -> str | None:
     names = [topic.name for topic in candidates]
     if requested is not None:
@@ -137,8 +192,9 @@ def _pick(
             )
         return requested
     if len(names) > 1:
-        usual = f"The {subject} are from {names[0]}, not {', '.join(names[1:5])}. {flag} selects another topic."
-        remarks.append(choice or usual)
+        usual = f"The {subject} are from {names[0]}, not {', '.join(names[1:5])}."
+        remedy = f"{flag} selects another topic."
+        remarks.append(choice or Remark(code=TOPIC_CHOICE, sentence=usual, remedy=remedy))
     return names[0] if names else None
 
 
@@ -179,16 +235,24 @@ class TopicSamples:
 
 
 @dataclass(frozen=True)
+class CameraStream:
+    """A camera: the stamps of its pictures, whose frame is that of the first, and its lens."""
+
+    images: TopicSamples
+    info: Any | None  # first `CameraInfo`, or None
+    info_topic: str | None
+
+
+@dataclass(frozen=True)
 class BagStreams:
     """The small messages of a bag."""
 
     path: Path
-    images: TopicSamples  # stamps of every message of the image topic; its frame is that of the first
+    camera: CameraStream  # of the photographs
+    others: tuple[CameraStream, ...]  # cameras that may expose together with it, where these are asked for
     positions: TopicSamples | None  # latitude, longitude, height (or east, north, up) and their σ
     attitudes: TopicSamples | None  # quaternion xyzw frame → East-North-Up, and σ in degrees
     transforms: Transforms
-    info: Any | None  # first `CameraInfo`, or None
-    info_topic: str | None
 
 
 def read_streams(bag: Bag, options: IngestOptions, remarks: Remarks, progress: Progress = SILENT) -> BagStreams:
@@ -203,8 +267,9 @@ def read_streams(bag: Bag, options: IngestOptions, remarks: Remarks, progress: P
     if topics.image is None:
         raise InputError(
             "no-image-topic",
-            "The bag has no topic of type sensor_msgs/Image or CompressedImage. `georef inspect` lists its topics.",
+            "The bag has no topic of type sensor_msgs/Image or CompressedImage.",
             path=bag.path,
+            remedy="`georef inspect` lists its topics.",
         )
     remarks.assume(
         "bag-topics",
@@ -212,17 +277,21 @@ def read_streams(bag: Bag, options: IngestOptions, remarks: Remarks, progress: P
         f"{topics.fix or 'none'}, attitudes from {topics.attitude or 'none'}.",
     )
     for remark in topics.remarks:
-        remarks.assume("bag-topic-choice", remark)
-    if topics.receivers_apart:
-        remarks.caution("receivers-apart", topics.receivers_apart)
+        add(remarks.assumptions, remark)
+    if topics.receivers_apart is not None:
+        add(remarks.cautions, topics.receivers_apart)
     images, positions, attitudes = (
         None if topic is None else TopicSamples(topic, bag.topics[topic].type, width)
         for topic, width in ((topics.image, 0), (topics.fix, 6), (topics.attitude, 5))
     )
     assert images is not None
-    transforms, info = Transforms(), None
+    pictures = {images.topic: images}
+    pictures |= {name: TopicSamples(name, bag.topics[name].type) for name, _ in topics.others}
+    transforms = Transforms()
+    infos: dict[str, Any] = {}
+    lenses = {topics.info, *(info for _, info in topics.others)} - {None}
     frames = [topic.name for topic in bag.topics.values() if topic.type in TRANSFORM_TYPES]
-    wanted = {topics.image, *frames, *filter(None, (topics.info, topics.fix, topics.attitude))}
+    wanted = {*pictures, *frames, *filter(None, (*lenses, topics.fix, topics.attitude))}
     undecodable: dict[str, list[str]] = {}
     read: Counter[str] = Counter()
     with progress.task("bag", sum(bag.topics[name].count for name in wanted)) as task:
@@ -230,28 +299,32 @@ def read_streams(bag: Bag, options: IngestOptions, remarks: Remarks, progress: P
             task.advance()
             read[message.topic] += 1
             try:
-                if message.topic == images.topic:
-                    images.add(bag.header_stamp_ns(message), message.bag_ns)
-                    images.frame = images.frame or _frame(bag, message)
-                elif message.topic == topics.info:
-                    info = info or bag.decode(message)
+                if (shown := pictures.get(message.topic)) is not None:
+                    shown.add(bag.header_stamp_ns(message), message.bag_ns)
+                    shown.frame = shown.frame or _frame(bag, message)
+                elif message.topic in lenses:
+                    infos[message.topic] = infos.get(message.topic) or bag.decode(message)
                 elif message.topic in frames:
                     transforms.add(bag.decode(message), static=message.topic.endswith("static"))
                 else:
                     _add_navigation(bag.decode(message), message, positions, attitudes)
             except UndecodableError as error:
                 undecodable.setdefault(message.topic, []).append(str(error)[:120])
-    series = [samples for samples in (images, positions, attitudes) if samples is not None]
+    series = [samples for samples in (*pictures.values(), positions, attitudes) if samples is not None]
     _require_read(bag, wanted, read, remarks)
     _note_losses(bag, series, undecodable, transforms.refused, remarks)
     _settle_clocks(series, remarks)
-    return BagStreams(bag.path, images, positions, attitudes, transforms, info, topics.info)
+    camera, *others = (
+        CameraStream(pictures[name], infos.get(info or ""), info)
+        for name, info in ((images.topic, topics.info), *topics.others)
+    )
+    return BagStreams(bag.path, camera, tuple(others), positions, attitudes, transforms)
 
 
 def _note_files(bag: Bag, options: IngestOptions, remarks: Remarks) -> None:
     """Note where `metadata.yaml` and the data files differ; refuse a topic to read whose messages are all lost."""
     for note in bag.notes:
-        (remarks.assume if note.code in _HARMLESS_NOTES else remarks.warn)(note.code, note.sentence)
+        add(remarks.assumptions if note.code in _HARMLESS_NOTES else remarks.warnings, note)
     roles: tuple[tuple[str | None, Container[str]], ...] = (
         (options.image_topic, (IMAGE, COMPRESSED)), (options.fix_topic, POSITIONS),
         (options.attitude_topic, ATTITUDES), (None, (INFO, *TRANSFORM_TYPES)),
@@ -313,7 +386,7 @@ def _note_losses(
 def _frame(bag: Bag, message: RawMessage) -> str:
     """Return the frame of an image; one that does not decode is counted when the photographs are read."""
     try:
-        return str(bag.decode(message).header.frame_id) or "camera"
+        return str(bag.decode(message).header.frame_id) or UNNAMED_FRAME
     except UndecodableError:
         return ""
 
@@ -346,7 +419,7 @@ def _settle_clocks(series: list[TopicSamples], remarks: Remarks) -> None:
 
     Messages without a stamp get the time of recording. Topics that count from another epoch than the rest (since
     boot) are brought to the recorder's clock by the median difference; if all do (a simulator's time), they keep
-    it. Clocks that are a known number of seconds apart (`bag_clocks`) become one. Left out are stamps that jump by
+    it. Clocks that are a known number of seconds apart (`bag_sources`) become one. Left out are stamps that jump by
     more than a minute against the recorder's clock, and those that are not later than one before.
     """
     raw = {
@@ -370,7 +443,7 @@ def _settle_clocks(series: list[TopicSamples], remarks: Remarks) -> None:
         time = np.where(stamp == 0, bag + offset[topic], stamp)
         if topic in shifts:
             time = time - int(shifts[topic].shift_s * 1e9)
-            (remarks.assume if shifts[topic].shift_s else remarks.warn)(shifts[topic].code, shifts[topic].sentence)
+            add(remarks.assumptions if shifts[topic].shift_s else remarks.warnings, shifts[topic].remark)
         moved = int(shifts[topic].shift_s * 1e9) if topic in shifts else 0
         jump = np.abs(time - bag - offset[topic] + moved) > _JUMP_NS
         _note_left_out(remarks, "stamp-jump", jump, topic, "have a stamp more than a minute off the others")

@@ -42,7 +42,7 @@ class Serials:
     aircraft: str = ""
 
     @property
-    def shown(self) -> str:
+    def number(self) -> str:
         """Number of the camera for people: of its body, else of the aircraft, and of the lens if that is all."""
         if self.exif_body or self.xmp_body:
             return self.exif_body or self.xmp_body
@@ -67,7 +67,7 @@ def _plain(number: str) -> str:
 
 def serials_of(tags: PhotoTags) -> Serials:
     """Return the serial numbers of a photograph; placeholders such as `0000` are none."""
-    found: dict[str, str] = {}
+    numbers: dict[str, str] = {}
     for key, kind in (
         ("EXIF BodySerialNumber", "exif_body"), ("Image CameraSerialNumber", "exif_body"),
         ("EXIF CameraSerialNumber", "exif_body"), ("Image BodySerialNumber", "exif_body"),
@@ -75,12 +75,12 @@ def serials_of(tags: PhotoTags) -> Serials:
     ):  # fmt: skip
         tag = tags.exif.get(key)
         if tag is not None and (text := _number_in(tag.text)):
-            found.setdefault(kind, text)
+            numbers.setdefault(kind, text)
     for each in tags.xmp.properties:
         role = _role(each)
         if role and (text := _number_in(each.text)):
-            found.setdefault(role, text)
-    return Serials(**found)
+            numbers.setdefault(role, text)
+    return Serials(**numbers)
 
 
 def _number_in(text: str) -> str:
@@ -92,10 +92,10 @@ def _role(each: XmpProperty) -> str:
     """Return the field of `Serials` that a property of XMP states, empty if none."""
     if not _SERIAL.search(each.name):
         return ""
-    own = f"{each.within} {_SERIAL.sub('', each.name)}"
-    if re.search("lens", own, re.IGNORECASE):
+    words = f"{each.within} {_SERIAL.sub('', each.name)}"
+    if re.search("lens", words, re.IGNORECASE):
         return "lens"
-    for text in (own, each.namespace):  # the name says more than the namespace, which may be the maker's
+    for text in (words, each.namespace):  # the name says more than the namespace, which may be the maker's
         if _OTHER_INSTRUMENT.search(text):
             return ""
         if _CAMERA.search(text):
@@ -122,7 +122,7 @@ def grouped_by_serials(serials: Sequence[Serials]) -> list[int]:
             number = len(cameras)
             cameras.append(serials[row])
         group[row] = number
-    order = {number: place for place, number in enumerate(dict.fromkeys(group))}
+    order = {number: rank for rank, number in enumerate(dict.fromkeys(group))}
     return [order[number] for number in group]
 
 
@@ -143,10 +143,10 @@ def fisheye_of(tags: PhotoTags, width: int, height: int) -> Fisheye | None:
     """
     stated = [each.text for each in tags.xmp.properties if each.name.casefold() in _LENS_NAMES]
     in_exif = (tags.exif.get(key) for key in ("EXIF LensModel", "Image LensModel"))
-    told = any(_FISHEYE.search(text) for text in (*stated, *(tag.text for tag in in_exif if tag is not None)))
+    is_named = any(_FISHEYE.search(text) for text in (*stated, *(tag.text for tag in in_exif if tag is not None)))
     affine, polynomial = (_numbers(tags.xmp.text(name)) for name in ("FisheyeAffineMatrix", "FisheyePolynomial"))
     perspective = any(re.search(r"\bperspective\b|rectilinear|brown", text, re.IGNORECASE) for text in stated)
-    if not (told or (affine and not perspective)) or tags.xmp.number(*_DEWARPED) == 1:
+    if not (is_named or (affine and not perspective)) or tags.xmp.number(*_DEWARPED) == 1:
         return None
     scale = max(width, height) / (tags.lens.taken_width_px or max(width, height))
     centre_px = _principal_point(tags, width, height, scale)

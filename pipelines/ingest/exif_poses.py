@@ -39,15 +39,16 @@ from pipelines.geometry.statistics import (
 from pipelines.ingest.flight_record import COMMON_SIGMA_M, ImagePoses, kind_of_receiver, with_defaults
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
-from pipelines.ingest.remarks import Remarks
+from pipelines.ingest.remarks import Remarks, add
 from pipelines.ingest.tag_headings import tagged_attitudes
 from pipelines.ingest.tag_positions import tagged_positions
 
 # Vertical over horizontal σ of a fix that states only the horizontal one.
 _VERTICAL_RATIO = 2.0
 _RECEIVER = {RTK_FIXED: "RTK fixed", RTK_FLOAT: "RTK float"}
-_SEA_LEVEL_NOTE = "but GPSAltitudeRef says that they count from sea level: --vertical names the geoid"
-_EXIF_NOTE = "EXIF's altitude is often above a geoid or barometric, and --vertical states its datum"
+_SEA_LEVEL_NOTE = "but GPSAltitudeRef says that they count from sea level"
+_EXIF_NOTE = "EXIF's altitude is often above a geoid or barometric"
+_OR_GO_ON = "Correct the wrong file, or continue with --accept-inconsistency."
 _SIGMAS, _LEAST_M = 4.0, 1.0
 _MOST_INCONSISTENT = 1 / 3
 _COMMON_SIGMAS = 3.0  # of a constant difference, which no number of positions explains
@@ -178,14 +179,15 @@ def compare_with_exif(
         common_m=float(np.hypot(_common_sigma(poses, both), _common_sigma(exif, both))),
     )
     heights_m = np.column_stack([in_table, lla[:, 2]])
-    found = (_horizontal(places, path), _heights(places.name, heights_m, apart[:, 2], sigma[:, 2], path))
-    for fatal, caution in filter(None, found):
+    differences = (_horizontal(places, path), _heights(places.name, heights_m, apart[:, 2], sigma[:, 2], path))
+    for fatal, caution in filter(None, differences):
         if fatal and not options.accept_inconsistency:
             raise InconsistencyError(
                 caution.code,
-                f"{path}: {caution.sentence} Correct the wrong file, or continue with --accept-inconsistency.",
+                f"{path}: {caution.sentence}",
+                remedy=" ".join(filter(None, (caution.remedy, _OR_GO_ON))),
             )
-        remarks.caution(caution.code, caution.sentence)
+        add(remarks.cautions, caution)
 
 
 @dataclass(frozen=True)
@@ -304,8 +306,8 @@ def _clock_offset(places: _Places) -> float | None:
     velocity = np.gradient(places.exif[order], time_s, axis=0)
     apart = (places.table - places.exif)[order]
     offset = float((velocity * apart).sum() / max((velocity**2).sum(), 1e-9))
-    left = scatter_about_median(apart - offset * velocity)
-    return offset if left < 0.5 * scatter_about_median(apart) else None
+    residual_m = scatter_about_median(apart - offset * velocity)
+    return offset if residual_m < 0.5 * scatter_about_median(apart) else None
 
 
 def _heights(
@@ -319,14 +321,14 @@ def _heights(
         bad = off_m > np.maximum(_SIGMAS * sigma_m, _LEAST_M)
         return (False, _few(names, off_m, bad, "heights", path)) if bad.any() else None
     for factor, cause in ((FOOT_M, "in feet, and taken for metres"), (1 / FOOT_M, "in metres, and taken for feet")):
-        left = abs(float(np.median(heights_m[:, 0] * factor - heights_m[:, 1])))
+        residual_m = abs(float(np.median(heights_m[:, 0] * factor - heights_m[:, 1])))
         tolerance = max(_UNIT_PART * abs(float(np.median(heights_m[:, 1]))), allowed / _SIGMAS)
-        if abs(offset) > _EVIDENT * allowed and left < tolerance:
+        if abs(offset) > _EVIDENT * allowed and residual_m < tolerance:
             sentence = f"The heights in {path.name} are {cause}: those in EXIF are {factor:.4g} times as large."
             return True, Remark(code="feet", sentence=sentence)
     sentence = (
         f"The heights in {path.name} differ from those in EXIF by {offset:+.1f} m (± {spread:.1f} m): one counts "
-        "from the ellipsoid, the other from a geoid, the take-off or a barometer's zero. State the datum with "
-        "--vertical."
+        "from the ellipsoid, the other from a geoid, the take-off or a barometer's zero."
     )
-    return abs(offset) > MOST_GEOID_M, Remark(code="heights-apart", sentence=sentence)
+    remedy = "State the datum with --vertical."
+    return abs(offset) > MOST_GEOID_M, Remark(code="heights-apart", sentence=sentence, remedy=remedy)

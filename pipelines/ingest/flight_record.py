@@ -105,7 +105,8 @@ class FlightRecord:
     """What was read of a flight; `navigation` is None where it was not recorded by time.
 
     `accompanying` are photographs of the other lenses of a rig, and `rotations` the stated ones of these lenses,
-    lens ← reference as x, y, z, w, by photograph.
+    lens ← reference as x, y, z, w, by photograph. `originals` has the hashes of the photographs in
+    `original_folder` of which `folder` has copies with fewer bits, by name.
     """
 
     folder: Path
@@ -116,6 +117,8 @@ class FlightRecord:
     navigation: RecordedNavigation | None
     accompanying: tuple[Accompanying, ...] = ()
     rotations: Mapping[str, Quaternion] = field(default_factory=dict)
+    original_folder: Path | None = None
+    originals: Mapping[str, str] = field(default_factory=dict)
 
 
 def kind_of_receiver(receiver: str, sigma_h_m: float) -> str:
@@ -153,7 +156,7 @@ def with_defaults(
         if rows.any() and parts:
             remarks.assume(
                 "default-position-sigma",
-                f"{int(rows.sum())} positions have no σ of their own: {', '.join(parts)} is assumed ({receiver}). "
+                f"{int(rows.sum())} positions have no σ of their own: {', '.join(parts)} is assumed ({receiver}).",
                 "State it with --sigma-h and --sigma-v.",
             )
     overridden = options.sigma_h is not None or options.sigma_v is not None
@@ -170,13 +173,13 @@ def track_in_geo(recorded: RecordedNavigation, origin: Origin) -> NavigationTrac
     # Attitudes are turned from north and up where each was taken. Where they begin or end beyond the positions, the
     # first or last position stands for the place: at 45° latitude north turns by a second of arc in 30 m.
     time_s = np.clip(attitudes.time_s, positions.time_s[0], positions.time_s[-1])
-    place = replace(positions, max_gap_s=np.inf).at(time_s).position
+    antenna_in_ecef = replace(positions, max_gap_s=np.inf).at(time_s).position
     return NavigationTrack(
         position_time_s=positions.time_s,
         antenna_in_geo=enu_from_ecef(positions.position, origin),
         sigma_m=positions.sigma_m,
         attitude_time_s=attitudes.time_s,
-        geo_from_body=geo_from_enu_at(lla_from_ecef(place), origin) @ attitudes.rotation,
+        geo_from_body=geo_from_enu_at(lla_from_ecef(antenna_in_ecef), origin) @ attitudes.rotation,
         image=np.array(recorded.images, dtype=np.str_),
         image_time_s=recorded.image_time_s,
         cam_from_body=mounts,
@@ -222,12 +225,14 @@ def require_enough(count: int, source: Path, field: str, remarks: Remarks) -> No
         raise InputError(
             "too-few-images",
             f"{count} images are usable, at least {LEAST_IMAGES} are needed.{reasons}",
+            remedy=" ".join(filter(None, (warning.remedy for warning in remarks.warnings))),
             path=source,
             field=field,
         )
 
 
 def given_rig(options: IngestOptions) -> Rig:
+    """Return mount, lever arm (metres, in body) and boresight as the options state them, None where they do not."""
     return Rig(
         cam_from_body=None if options.camera_mount is None else mount(options.camera_mount),
         antenna_in_body=None if options.lever_arm is None else np.array(options.lever_arm),
@@ -249,8 +254,9 @@ def at_cameras(poses: ImagePoses, rig: Rig, names: Sequence[str], remarks: Remar
     if rig.antenna_in_body is not None and rig.cam_from_body is None:
         raise InputError(
             "mount-missing",
-            "--lever-arm is given in the axes of the body. Give these with --camera-mount YAW,PITCH,ROLL.",
+            "--lever-arm is given in the axes of the body.",
             field="--lever-arm",
+            remedy="Give these with --camera-mount YAW,PITCH,ROLL.",
         )
     mounted = replace(rig, cam_from_body=body_mount(rig))
     enu_from_body = poses.enu_from_cam @ body_mount(rig)

@@ -1,6 +1,7 @@
 """A flight out of a folder of photographs: with their tags alone, with a table of poses, or with DJI's events.
 
-Events are tied to photographs by the number in a photograph's name.
+Events are tied to photographs by the number in a photograph's name. Remarks name tags that are unusable, corrected
+or repeated.
 """
 
 from collections.abc import Sequence
@@ -20,13 +21,12 @@ from pipelines.formats.trajectory_csv import PoseTable, read_trajectory
 from pipelines.geodesy.enu import ecef_from_enu_rotation, lla_from_ecef
 from pipelines.geometry.trajectory import Rig, Trajectory
 from pipelines.ingest import flight_record
-from pipelines.ingest.event_ties import event_numbers, rows_by_order
 from pipelines.ingest.exif_poses import poses_from_tags
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo, camera_priors, scan_folder
-from pipelines.ingest.photo_times import with_times
+from pipelines.ingest.photo_times import event_numbers, rows_by_order, with_times
 from pipelines.ingest.reference_system import is_projected
-from pipelines.ingest.remarks import Remarks
+from pipelines.ingest.remarks import Remarks, shortened
 from pipelines.ingest.rig_instants import photos_of_rig
 from pipelines.ingest.sensors import with_sensors
 from pipelines.ingest.stray_pictures import (
@@ -36,7 +36,6 @@ from pipelines.ingest.stray_pictures import (
     without_reduced_copies,
 )
 from pipelines.ingest.table_poses import poses_from_table
-from pipelines.ingest.tag_contents import note_repeats, note_tags
 
 # The camera's clock has whole seconds and may be hours off, but runs evenly: a photograph counted wrongly shows.
 _MOST_SPREAD_S = 3.0
@@ -76,9 +75,9 @@ def read_folder(
     if options.time_offset_s and poses.recorded is None:
         raise InputError(
             "time-offset-without-times",
-            "--time-offset needs a --bag, or a --trajectory with times and without image names. Remove "
-            "--time-offset.",
+            "--time-offset needs a --bag, or a --trajectory with times and without image names.",
             field="--time-offset",
+            remedy="Remove --time-offset.",
         )
     rig, names = flight_record.given_rig(options), [photo.name for photo in photos]
     located = np.where(poses.located[:, None], poses.position_in_ecef, np.nan)
@@ -114,8 +113,9 @@ def _poses(
     if table.names is not None:
         raise InputError(
             "events-without-times",
-            f"--events needs a trajectory with times; {table.path.name} lists image names. Remove --events.",
+            f"--events needs a trajectory with times; {table.path.name} lists image names.",
             field="--events",
+            remedy="Remove --events.",
         )
     events = read_mrk(options.events)
     rows = _event_of_each(events, photos, remarks)
@@ -209,9 +209,12 @@ def _event_of_each(events: CameraEvents, photos: Sequence[Photo], remarks: Remar
     if len(folders) > 1:
         raise InputError(
             "event-folders",
-            "The file numbers the photographs of one flight, but its numbers occur in several folders "
-            f"({', '.join(folders[:3])}). Give one folder and its file.",
+            (
+                "The file numbers the photographs of one flight, but its numbers occur in several folders ("
+                f"{', '.join(folders[:3])})."
+            ),
             path=events.path,
+            remedy="Give one folder and its file.",
         )
     _refuse_other_times(events, [(photo, row) for photo, row in tied if photo.tags.timestamp_s])
     remarks.warn_counted(
@@ -263,3 +266,49 @@ def _navigation(
         image_time_s=time_s[timed],
         time_offset_s=options.time_offset_s,
     )
+
+
+_LEAST = 3
+_REPEATED = 0.3  # of the photographs, from which repeats are no hovering
+_SAME_DEG = 1e-9
+
+
+def note_tags(photos: Sequence[Photo], remarks: Remarks) -> None:
+    """Note tags that are not used, and those of a wrong form with the way in which they are read."""
+    for problem in sorted({problem for photo in photos for problem in photo.tags.problems}):
+        with_it = [photo.name for photo in photos if problem in photo.tags.problems]
+        remarks.warn_counted("exif-unusable", with_it, f"Tags of images are not used, because {problem}")
+    for correction in sorted({correction for photo in photos for correction in photo.tags.corrections}):
+        with_it = [photo.name for photo in photos if correction in photo.tags.corrections]
+        remarks.warn_counted("tag-corrected", with_it, correction.removesuffix("."))
+    remarks.warn_counted(
+        "exif-orientation",
+        [photo.name for photo in photos if photo.tags.orientation != 1],
+        "Images have an EXIF orientation, which is ignored: pixels are read as stored",
+    )
+
+
+def note_repeats(names: Sequence[str], lat_lon_deg: FloatArray, time_s: FloatArray, remarks: Remarks) -> None:
+    """Note places (N, 2), NaN where unknown, that photographs of other moments repeat."""
+    known = np.flatnonzero(np.isfinite(lat_lon_deg).all(axis=1))
+    if len(known) < _LEAST:
+        return
+    if np.ptp(lat_lon_deg[known], axis=0).max() < _SAME_DEG:
+        remarks.caution(
+            "one-position-for-all",
+            f"All {len(known)} photographs have one position: programs write that of an album, and receivers "
+            "without a fix repeat the last. It says nothing about the size or the heading of the survey.",
+        )
+        return
+    if np.isfinite(time_s[known]).all():
+        known = known[np.argsort(time_s[known], kind="stable")]
+    places, times = lat_lon_deg[known], time_s[known]
+    same = np.abs(np.diff(places, axis=0)).max(axis=1) < _SAME_DEG
+    same &= ~(np.abs(np.diff(times)) < 0.5)  # two cameras of one moment; an unknown time is another
+    if same.sum() >= max(2.0, _REPEATED * len(known)):
+        remarks.caution(
+            "positions-repeat",
+            f"{int(same.sum())} of {len(known)} photographs repeat the position of the one before them: "
+            f"{shortened([names[row] for row in known[1:][same]])}. The receiver had no new fix, or the "
+            "camera hovered.",
+        )

@@ -1,7 +1,12 @@
-"""Control and check points on Earth, out of files recognised by their content, with marks tied to the images."""
+"""Control and check points on Earth, out of files recognised by their content, with marks tied to the images.
+
+Marks made on photographs as EXIF's orientation shows them are brought to the pixels as they are stored: browsers
+and most programs for marking turn a photograph as EXIF says; cameras, COLMAP and this program count pixels as they
+are stored (EXIF 2.32, tag 0x0112).
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -26,10 +31,82 @@ from pipelines.ingest.reference_system import (
     require_heights,
 )
 from pipelines.ingest.remarks import Remarks, shortened
-from pipelines.ingest.shown_marks import ShownMarks
 from pipelines.ingest.targets import Targets
 from pipelines.survey.image_names import ImageNames
 from pipelines.survey.survey import KnownDistance, Mark, PointMarks
+
+_UPRIGHT = 1
+_QUARTER_TURNS = range(5, 9)
+
+
+def shown_size(orientation: int, width: int, height: int) -> tuple[int, int]:
+    """Return width and height of a picture as shown, of those as stored."""
+    return (height, width) if orientation in _QUARTER_TURNS else (width, height)
+
+
+def stored_pixel(orientation: int, x: float, y: float, width: int, height: int) -> tuple[float, float]:
+    """Return the stored place of a place in a shown picture, in pixels from its left and upper edge.
+
+    Width and height are those as stored.
+    """
+    return {
+        2: (width - x, y),
+        3: (width - x, height - y),
+        4: (x, height - y),
+        5: (y, x),
+        6: (y, height - x),
+        7: (width - y, height - x),
+        8: (width - y, x),
+    }.get(orientation, (x, y))
+
+
+@dataclass
+class ShownMarks:
+    """How marks were made: as the pictures are shown, or as they are stored; and which marks that concerns."""
+
+    orientations: Mapping[str, int] = field(default_factory=dict)  # by name; EXIF's number, 1 where it has none
+    as_shown: bool = False
+    marks: int = 0  # in pictures that EXIF turns
+    images: set[str] = field(default_factory=set)  # such pictures
+
+    def stored(self, image: str, x: float, y: float, size: tuple[int, int]) -> tuple[float, float]:
+        """Return the stored place of a mark in an image of a stored size (width, height)."""
+        orientation = self.orientations.get(image, _UPRIGHT)
+        if orientation == _UPRIGHT:
+            return x, y
+        self.marks += 1
+        self.images.add(image)
+        return stored_pixel(orientation, x, y, *size) if self.as_shown else (x, y)
+
+    def why_outside(self, image: str, x: float, y: float, size: tuple[int, int]) -> str | None:
+        """Return why a mark outside its image lies inside it as shown, or as stored; None: it does not."""
+        orientation = self.orientations.get(image, _UPRIGHT)
+        if orientation == _UPRIGHT:
+            return None
+        width, height = size if self.as_shown else shown_size(orientation, *size)
+        if not (0.0 <= x <= width and 0.0 <= y <= height):
+            return None
+        if self.as_shown:
+            return "It lies inside the picture as stored: remove --marks-as-shown."
+        return (
+            f"EXIF turns this photograph (orientation {orientation}), and the mark lies inside the picture as "
+            f"shown, {width}×{height} px. If marks were made on turned pictures, give --marks-as-shown."
+        )
+
+    def note(self, remarks: Remarks) -> None:
+        """Note how marks in turned pictures were read."""
+        where = f"{self.marks} marks in {len(self.images)} photographs that EXIF turns"
+        if self.as_shown and not self.marks:
+            remarks.warn("no-mark-turned", "EXIF turns no marked photograph.", "--marks-as-shown changes nothing.")
+        elif self.as_shown:
+            remarks.assume("marks-as-shown", f"{where} were made on the pictures as shown: they are turned back.")
+        elif self.marks:
+            remarks.warn(
+                "marks-as-stored",
+                f"{where} ({shortened(sorted(self.images))}) are read in pixels as stored.",
+                "If they were made on the pictures as shown, give --marks-as-shown.",
+            )
+
 
 _LEAST_MARKS = 2
 # Two names at one place are one point; a point this far from the cameras is in another country.
@@ -109,8 +186,8 @@ def ends_of(options: IngestOptions) -> set[str]:
 
 def _with_table_of_marks(file: GroundFile, path: Path, marks: Sequence[ListedMark]) -> GroundFile:
     names = {point.name for point in file.points}
-    own = tuple(mark for mark in marks if mark.name in names)
-    return replace(file, listed_marks=(*file.listed_marks, (path, own)))
+    of_file = tuple(mark for mark in marks if mark.name in names)
+    return replace(file, listed_marks=(*file.listed_marks, (path, of_file)))
 
 
 def _recognised(path: Path, options: IngestOptions, remarks: Remarks) -> GroundPoints:
@@ -186,11 +263,11 @@ def tie_marks(
     remarks: Remarks,
     targets: Targets | None = None,
     *,
-    shown: ShownMarks | None = None,
+    marking: ShownMarks | None = None,
 ) -> GroundFile:
     """Return the points of a file with their marks in the images; marks in images that are not here are noted.
 
-    `sizes` has width and height of each image by name. `targets` are marks where the file has none. `shown` turns
+    `sizes` has width and height of each image by name. `targets` are marks where the file has none. `marking` turns
     marks that were made on pictures as shown.
 
     Raises:
@@ -203,7 +280,7 @@ def tie_marks(
         sigma_px,
         remarks,
         targets=targets,
-        shown=shown or ShownMarks(),
+        marking=marking or ShownMarks(),
     )
     return replace(file, points=tuple(replace(point, marks=marks[point.name]) for point in file.points))
 
@@ -216,7 +293,7 @@ def _tied(
     remarks: Remarks,
     *,
     targets: Targets | None,
-    shown: ShownMarks,
+    marking: ShownMarks,
 ) -> dict[str, tuple[Mark, ...]]:
     """Return the marks of points by name; raises as `tie_marks`."""
     names = ImageNames(sizes)
@@ -229,9 +306,9 @@ def _tied(
                 unknown.append(f"{path.name}:{mark.line} ({mark.image})")
                 continue
             (width, height), fault = sizes[image], partial(InputError, path=path, line=mark.line)
-            x_px, y_px = shown.stored(image, mark.x_px, mark.y_px, sizes[image])
+            x_px, y_px = marking.stored(image, mark.x_px, mark.y_px, sizes[image])
             if not (0.0 <= x_px <= width and 0.0 <= y_px <= height):
-                turned = shown.why_outside(image, mark.x_px, mark.y_px, sizes[image])
+                turned = marking.why_outside(image, mark.x_px, mark.y_px, sizes[image])
                 raise fault(
                     "mark-outside-image" if turned is None else "mark-on-turned-picture",
                     f"The mark of {mark.name} at ({mark.x_px:g}, {mark.y_px:g}) lies outside {image} "
@@ -260,10 +337,13 @@ def _require_pixels(path: Path, listed: Sequence[ListedMark], sizes: Mapping[str
     if len(listed) >= _FEWEST_FRACTIONS and within and min(map(min, sizes.values())) > 2:
         raise InputError(
             "marks-are-fractions",
-            f"All {len(listed)} marks lie within the first pixel of their images: they are fractions of the "
-            "width and height. Write them in pixels.",
+            (
+                f"All {len(listed)} marks lie within the first pixel of their images: they are fractions of the "
+                "width and height."
+            ),
             path=path,
             field="px py",
+            remedy="Write them in pixels.",
         )
 
 
@@ -274,7 +354,7 @@ def known_distances(
     remarks: Remarks,
     targets: Targets | None = None,
     *,
-    shown: ShownMarks | None = None,
+    marking: ShownMarks | None = None,
 ) -> tuple[KnownDistance, ...]:
     """Return the measured distances of `--distances`, whose ends are points of files, of `--marks`, or targets.
 
@@ -288,27 +368,34 @@ def known_distances(
     others = sorted({name for distance in listed for name in distance.ends} - marks.keys())
     listed_marks: list[tuple[Path, Sequence[ListedMark]]] = []
     if others and options.marks is not None:
-        own = tuple(mark for mark in ground_points.read_marks(options.marks) if mark.name in others)
-        listed_marks.append((options.marks, own))
+        of_ends = tuple(mark for mark in ground_points.read_marks(options.marks) if mark.name in others)
+        listed_marks.append((options.marks, of_ends))
     marks |= _tied(
-        others, listed_marks, sizes, options.sigma_mark, remarks, targets=targets, shown=shown or ShownMarks()
+        others,
+        listed_marks,
+        sizes,
+        options.sigma_mark,
+        remarks,
+        targets=targets,
+        marking=marking or ShownMarks(),
     )
     for distance in listed:
-        for field, name in zip(("from", "to"), distance.ends, strict=True):
+        for end, name in zip(("from", "to"), distance.ends, strict=True):
             if len(marks[name]) < _LEAST_MARKS:
                 raise InputError(
                     "distance-end-unmarked",
-                    f"{name} has marks in {len(marks[name])} images. Mark it in two or more: --marks.",
+                    f"{name} has marks in {len(marks[name])} images.",
                     path=options.distances,
                     line=distance.line,
-                    field=field,
+                    field=end,
+                    remedy="Mark it in two or more: --marks.",
                 )
     silent = sum(distance.sigma_m is None for distance in listed)
     if silent:
         remarks.assume(
             "default-distance-sigma",
-            f"{silent} distances have a σ of {options.sigma_distance:g} m. State it in the file, or with "
-            "--sigma-distance.",
+            f"{silent} distances have a σ of {options.sigma_distance:g} m.",
+            "State it in the file, or with --sigma-distance.",
         )
     return tuple(
         KnownDistance(
@@ -349,9 +436,10 @@ def split_checks(
         if check is not None and twin is not None:
             raise InputError(
                 "point-control-and-check",
-                f"{point.name} is also control point {twin.name} (line {twin.line}). Remove one of them.",
+                f"{point.name} is also control point {twin.name} (line {twin.line}).",
                 path=check.path,
                 line=point.line,
+                remedy="Remove one of them.",
             )
     moved = [point.name in names or point.is_check for point in points]
     kept = tuple(point for point, is_check in zip(points, moved, strict=True) if not is_check)

@@ -54,18 +54,20 @@ def known_ground(
     flight: FlightRecord,
 ) -> tuple[KnownGround, ...]:
     """Return the heights of surveyed points, and that of `--ground-height`, in the datum of `--vertical`."""
-    found = []
+    sources = []
     for file in files:
         if file.points:
             heights = lla_from_ecef([point.position_in_ecef for point in file.points])[:, 2]
-            found.append(KnownGround(f"the points of {file.path.name}", heights, not file.crs.vertical.is_assumed))
+            sources.append(
+                KnownGround(f"the points of {file.path.name}", heights, not file.crs.vertical.is_assumed)
+            )
     located = flight.poses.located
     if ground_height_m is not None and located.any():
         lat, lon, _ = np.median(lla_from_ecef(flight.poses.position_in_ecef[located]), axis=0)
         crs = parse_crs(WGS84, vertical=vertical)
         height = crs.lla_from_xyz([[lon, lat, ground_height_m]])[:, 2]
-        found.append(KnownGround("the terrain of --ground-height", height, not crs.vertical.is_assumed))
-    return tuple(found)
+        sources.append(KnownGround("the terrain of the stated height", height, not crs.vertical.is_assumed))
+    return tuple(sources)
 
 
 def height_doubts(flight: FlightRecord, ground: Sequence[KnownGround]) -> tuple[HeightDoubt, ...]:
@@ -80,10 +82,10 @@ def height_doubts(flight: FlightRecord, ground: Sequence[KnownGround]) -> tuple[
     rows = np.flatnonzero(poses.located)
     if len(rows) < _LEAST:
         return ()
-    place = poses.position_in_ecef[rows]
-    height = lla_from_ecef(place)[:, 2]
+    cam_center_in_ecef = poses.position_in_ecef[rows]
+    height = lla_from_ecef(cam_center_in_ecef)[:, 2]
     doubts = _equal_to_relative(flight, rows, height)
-    width_m = float(np.linalg.norm(np.ptp(place, axis=0)))
+    width_m = float(np.linalg.norm(np.ptp(cam_center_in_ecef, axis=0)))
     doubts += tuple(
         doubt
         for each in ground
@@ -124,9 +126,11 @@ def _equal_to_relative(flight: FlightRecord, rows: np.ndarray, height: FloatArra
         sentence = (
             f"The heights of {int(both.sum())} photographs count from the take-off: they equal RelativeAltitude "
             f"({low:.1f} to {high:.1f} m). The height of the take-off is unknown, and so is every height of the "
-            "result. Give control points with heights (--gcp), or positions with heights (--trajectory)."
+            "result."
         )
-        return (HeightDoubt(Remark(code="heights-above-takeoff", sentence=sentence), SIGMA_TAKE_OFF_M),)
+        remedy = "Give control points with heights (--gcp), or positions with heights (--trajectory)."
+        remark = Remark(code="heights-above-takeoff", sentence=sentence, remedy=remedy)
+        return (HeightDoubt(remark, SIGMA_TAKE_OFF_M),)
     return ()
 
 
@@ -153,10 +157,10 @@ def _against_ground(height: FloatArray, ground: KnownGround, width_m: float, *, 
     low, high = float(height.min()), float(height.max())
     sentence = (
         f"{what} (medians). The heights of the cameras, {low:.1f} to {high:.1f} m, may count from the take-off, or "
-        "one side has another datum or unit. Their zero counts as unknown: control points decide the heights. "
-        "Check both, and state the datum with --vertical."
+        "one side has another datum or unit. Their zero counts as unknown: control points decide the heights."
     )
-    return HeightDoubt(Remark(code=code, sentence=sentence), max(SIGMA_DATUM_M, abs(apart_m)))
+    remedy = "Check both, and state the datum with --vertical."
+    return HeightDoubt(Remark(code=code, sentence=sentence, remedy=remedy), max(SIGMA_DATUM_M, abs(apart_m)))
 
 
 def _begins_near_zero(height: FloatArray, time_s: FloatArray) -> tuple[HeightDoubt, ...]:
@@ -167,7 +171,10 @@ def _begins_near_zero(height: FloatArray, time_s: FloatArray) -> tuple[HeightDou
         return ()
     sentence = (
         f"The heights begin at {first:.1f} m and climb to {top:.1f} m: they may count from the take-off, and "
-        "nobody stated their datum. Where the take-off lies at sea level they may be right: then state it with "
-        "--vertical. Else give control points with heights (--gcp), or positions with heights (--trajectory)."
+        "nobody stated their datum. Where the take-off lies at sea level they may be right."
     )
-    return (HeightDoubt(Remark(code="heights-begin-at-zero", sentence=sentence), SIGMA_DATUM_M),)
+    remedy = (
+        "Then state it with --vertical. Else give control points with heights (--gcp), or positions with heights "
+        "(--trajectory)."
+    )
+    return (HeightDoubt(Remark(code="heights-begin-at-zero", sentence=sentence, remedy=remedy), SIGMA_DATUM_M),)

@@ -40,7 +40,7 @@ def mask_files(options: IngestOptions, names: Sequence[str], remarks: Remarks) -
     Raises:
         InputError: no folder, no mask of a photograph in it, or a file that is no image.
     """
-    found: dict[str, list[Path]] = {name: [] for name in names}
+    files_of: dict[str, list[Path]] = {name: [] for name in names}
     if options.masks is not None:
         root, known = options.masks, ImageNames(names)
         if not root.is_dir():
@@ -54,21 +54,22 @@ def mask_files(options: IngestOptions, names: Sequence[str], remarks: Remarks) -
             if name is None:
                 foreign.append(written)
             else:
-                found[name].append(path)
-        if not any(found.values()):
+                files_of[name].append(path)
+        if not any(files_of.values()):
             raise InputError(
                 "no-mask-matches",
-                "No mask has the name of a photograph. Name each as its photograph with .png added.",
+                "No mask has the name of a photograph.",
                 path=root,
                 field="--masks",
+                remedy="Name each as its photograph with .png added.",
             )
         remarks.warn_counted("mask-without-photograph", foreign, "Masks without a photograph are not used")
     if options.mask is not None:
-        for files in found.values():
+        for files in files_of.values():
             files.append(options.mask)
-    for path in {path for files in found.values() for path in files}:
+    for path in {path for files in files_of.values() for path in files}:
         inspect_image(read_head(path), path, decode=False)
-    return {name: tuple(files) for name, files in found.items() if files}
+    return {name: tuple(files) for name, files in files_of.items() if files}
 
 
 def write_masks(
@@ -91,28 +92,28 @@ def write_masks(
         for photograph in survey.images:
             image = photograph
             camera = cameras[image.camera_id]
-            shown = np.ones((camera.height, camera.width), dtype=bool)
+            scene = np.ones((camera.height, camera.width), dtype=bool)
             for path in files.get(image.name, ()):
-                shown &= _read_mask(path, image.name, camera)
+                scene &= _read_mask(path, image.name, camera)
             if options.mask_sky:
                 sky = _sky_of(image, camera, images)
                 if sky is None:
                     unseen.append(image.name)
                 else:
-                    shown &= ~sky
-            if not shown.any():
+                    scene &= ~sky
+            if not scene.any():
                 raise InputError(
                     "mask-leaves-nothing",
                     f"Its masks leave no pixel of {image.name}. White pixels are used, black are not.",
                     path=files.get(image.name, (images / image.name,))[0],
                     field="--masks",
                 )
-            if shown.mean() < _LEAVES_LITTLE:
+            if scene.mean() < _LEAVES_LITTLE:
                 little.append(image.name)
-            if not shown.all():
+            if not scene.all():
                 path = folder / f"{image.name}.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
-                png = cv2.imencode(".png", np.where(shown, np.uint8(255), np.uint8(0)))[1].tobytes()
+                png = cv2.imencode(".png", np.where(scene, np.uint8(255), np.uint8(0)))[1].tobytes()
                 path.write_bytes(png)
                 image = image.model_copy(update={"mask_sha256": hashlib.sha256(png).hexdigest()})
             masked.append(image)
@@ -132,10 +133,10 @@ def _read_mask(path: Path, name: str, camera: CameraPrior) -> BoolArray:
     if (size.width, size.height) != (camera.width, camera.height):
         raise InputError(
             "mask-size",
-            f"The mask has {size.width}×{size.height} pixels, and {name} {camera.width}×{camera.height}. "
-            "Make it of the size of the photograph as stored.",
+            (f"The mask has {size.width}×{size.height} pixels, and {name} {camera.width}×{camera.height}."),
             path=path,
             field="--masks",
+            remedy="Make it of the size of the photograph as stored.",
         )
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(pixels) > 0

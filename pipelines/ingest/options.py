@@ -22,6 +22,8 @@ from pipelines.formats.image_file import HEIF_SUFFIXES, SUFFIXES
 from pipelines.geodesy.vertical import Vertical
 from pipelines.survey.survey import RigParameter, RigParameters, in_usual_order
 
+ALL_SENSORS = "all"  # of --sensor: the lenses that expose together
+
 
 @dataclass(frozen=True)
 class Every:
@@ -80,14 +82,28 @@ TagDictionaries = Annotated[
 
 
 class IngestOptions(StageOptions):
-    """What `georef ingest` reads, and what it assumes where the files are silent."""
+    """What `georef ingest` reads, and what it assumes where the files are silent.
+
+    Positions come from the photographs' EXIF and XMP, or from a trajectory (CSV, RTKLIB, DJI, Metashape) or an ODM
+    geo.txt; or photographs and positions come from a ROS bag. Photographs in a folder are referenced where they
+    are, unless --copy. Check points never enter any solve. Points without marks are listed for marking later.
+
+    Examples:
+      georef ingest flight --images photos
+      georef ingest flight --images photos --gcp gcp_list.txt --check P7 --check P9
+      georef ingest flight --images photos --trajectory track.csv --crs EPSG:32632 --vertical EGM2008
+      georef ingest flight --images photos --trajectory flight_Timestamp.MRK --gcp markers.xml
+      georef ingest flight --images photos --gcp gcps.csv --gcp-crs EPSG:2056+5728 --marks marks.csv
+      georef ingest flight --bag flight_bag --every 5m --camera-mount 0,-90,0
+      georef ingest flight --images photos --geo geo.txt --checkpoints checkpoints.txt --test-every 10
+    """
 
     images: PhotographFolder | None = Field(None, description="Folder of photographs.")
     sensor: str | None = Field(
         None,
         description="Sensor whose photographs are used, where the folder holds several: visible, wide, zoom, "
-        "thermal, or a band such as green, red, red-edge, nir (default: a visible one); all: those that were "
-        "exposed together with it, too, as a rig.",
+        "thermal, or a band such as green, red, red-edge, nir (default: a visible one); all, of a bag too: those "
+        "that were exposed together with it, too, as a rig.",
     )
     rig: InputPath | None = Field(
         None,
@@ -265,35 +281,45 @@ def check_options(options: IngestOptions, frames: Path | None) -> None:
         _check_video(options, frames)
     if options.trajectory is not None and options.geo is not None:
         raise InputError(
-            "two-position-files", "--trajectory and --geo are both given. Remove one of them.", field="--geo"
+            "two-position-files",
+            "--trajectory and --geo are both given.",
+            field="--geo",
+            remedy="Remove one of them.",
         )
     if options.crs is not None and options.trajectory is None:
         raise InputError(
             "crs-without-trajectory",
-            "--crs is for the x,y,z columns of --trajectory; other files state their CRS. Remove --crs.",
+            "--crs is for the x,y,z columns of --trajectory; other files state their CRS.",
             field="--crs",
+            remedy="Remove --crs.",
         )
     if options.events is not None and (options.trajectory is None or options.lever_arm is not None):
         raise InputError(
             "events-need-antenna-track",
-            "--events needs the antenna's --trajectory with times, and has the lever arm itself. Give "
-            "--trajectory, and remove --lever-arm. A .MRK without a trajectory is given by --trajectory.",
+            "--events needs the antenna's --trajectory with times, and has the lever arm itself.",
             field="--events",
+            remedy=(
+                "Give --trajectory, and remove --lever-arm. A .MRK without a trajectory is given by --trajectory."
+            ),
         )
     for name in ("marks", "targets", "gcp_crs", "marks_as_shown"):
         needed = (options.gcp, options.checkpoints, options.distances if name != "gcp_crs" else None)
         if getattr(options, name) not in (None, False) and not any(needed):
             flag = flag_name(IngestOptions, name)
             raise InputError(
-                "needs-ground-points", f"{flag} needs ground points. Give --gcp or --checkpoints.", field=flag
+                "needs-ground-points",
+                f"{flag} needs ground points.",
+                field=flag,
+                remedy="Give --gcp or --checkpoints.",
             )
     if options.check and options.gcp is None:
         raise InputError("check-without-gcp", "--check names points of --gcp, which is not given.", field="--check")
     if options.test_every == 1:
         raise InputError(
             "nothing-to-train-on",
-            "--test-every 1 leaves no image to train on. Give 0, or 2 and more.",
+            "--test-every 1 leaves no image to train on.",
             field="--test-every",
+            remedy="Give 0, or 2 and more.",
         )
 
 
@@ -314,17 +340,21 @@ def _check_bag(options: IngestOptions, frames: Path | None) -> None:
     if options.crs is not None:
         raise InputError(
             "crs-with-bag",
-            "A --bag has latitude, longitude and ellipsoidal height, or metres from --origin. Remove --crs.",
+            "A --bag has latitude, longitude and ellipsoidal height, or metres from --origin.",
             field="--crs",
+            remedy="Remove --crs.",
         )
     beside = [
         name
         for name in ("images", "sensor", "rig", "trajectory", "geo", "events")
-        if getattr(options, name) is not None
+        if getattr(options, name) not in (None, ALL_SENSORS if name == "sensor" else None)
     ]
     if beside:
+        flag = flag_name(IngestOptions, beside[0])
+        hint = " --image-topic chooses a camera." if beside[0] == "sensor" else ""
         raise InputError(
             "bag-and-other-source",
-            f"A --bag already has photographs and positions. Remove --{beside[0]}.",
+            "A --bag already has photographs and positions.",
             field="--bag",
+            remedy=f"Remove {flag}.{hint}",
         )

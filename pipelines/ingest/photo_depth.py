@@ -68,7 +68,21 @@ def with_common_scale(
         _note(scale, of_camera[camera], remarks)
     photos = [changed[photo.name] for photo in flight.photos]
     accompanying = tuple(replace(each, photo=changed[each.photo.name]) for each in flight.accompanying)
-    return replace(flight, folder=folder.resolve(), photos=photos, accompanying=accompanying)
+    kept = {
+        photo.name: photo.file.sha256
+        for photo in everything
+        if flight.camera_of[photo.name] in scales and photo.file.values is not None
+    }
+    if flight.folder.resolve() == folder.resolve():  # converted files, which were replaced
+        kept = {}
+    return replace(
+        flight,
+        folder=folder.resolve(),
+        photos=photos,
+        accompanying=accompanying,
+        original_folder=flight.folder if kept else None,
+        originals=kept,
+    )
 
 
 def _scale(photos: Iterable[Photo]) -> _Scale | None:

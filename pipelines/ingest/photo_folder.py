@@ -255,12 +255,16 @@ def focal_px(tags: PhotoTags, width: int, height: int) -> tuple[float, FocalSour
     contradicts the next, as that of a preview or of another unit does; 35 mm equivalent by the diagonal (CIPA
     DCG-001); else 0.85 of the longer side. The phrase names all that differ from what is used.
     """
-    found = _focal_lengths(tags, width, height)
-    if not found:
+    by_source = _focal_lengths(tags, width, height)
+    if not by_source:
         return ASSUMED_RATIO * max(width, height), "assumed", f"assumed as {ASSUMED_RATIO:g} of the longer side"
-    if "plane" in found and "equivalent" in found and not _near(found["plane"][0], found["equivalent"][0]):
-        found["plane"] = found.pop("plane")  # behind the equivalent
-    (focal, origin), *others = found.values()
+    if (
+        "plane" in by_source
+        and "equivalent" in by_source
+        and not _near(by_source["plane"][0], by_source["equivalent"][0])
+    ):
+        by_source["plane"] = by_source.pop("plane")  # behind the equivalent
+    (focal, origin), *others = by_source.values()
     apart = [f"{value:.0f} px {how}" for value, how in others if not _near(value, focal)]
     return focal, "exif", f"{origin}{f', and not {listed(apart)}' if apart else ''}"
 
@@ -270,21 +274,21 @@ def _focal_lengths(tags: PhotoTags, width: int, height: int) -> dict[str, tuple[
     lens, long_side = tags.lens, max(width, height)
     scale = long_side / (lens.taken_width_px or long_side)
     sensor_mm = _SENSOR_WIDTH_MM.get(tags.model.strip().upper())
-    found: dict[str, tuple[float, str]] = {}
+    by_source: dict[str, tuple[float, str]] = {}
     if lens.focal_mm and sensor_mm:
         focal = lens.focal_mm * lens.zoom / sensor_mm * long_side
-        found["sensor"] = (focal, f"from {lens.focal_mm:g} mm on a sensor {sensor_mm:g} mm wide")
+        by_source["sensor"] = (focal, f"from {lens.focal_mm:g} mm on a sensor {sensor_mm:g} mm wide")
     calibrated = tags.xmp.number("CalibratedFocalLength") or tags.xmp.number("X", within="CalibratedFocalLength")
     if calibrated is not None:
-        found["calibrated"] = (calibrated * scale, "from CalibratedFocalLength in XMP")
+        by_source["calibrated"] = (calibrated * scale, "from CalibratedFocalLength in XMP")
     if lens.focal_mm and lens.px_per_mm:
         focal = lens.focal_mm * lens.zoom * lens.px_per_mm * scale
-        found["plane"] = (focal, f"from {lens.focal_mm:g} mm and the focal plane resolution")
+        by_source["plane"] = (focal, f"from {lens.focal_mm:g} mm and the focal plane resolution")
     if lens.focal_35mm_mm:
         focal = lens.focal_35mm_mm / _FILM_DIAGONAL_MM * math.hypot(width, height)
-        found["equivalent"] = (focal, f"from {lens.focal_35mm_mm:g} mm on 35 mm film")
+        by_source["equivalent"] = (focal, f"from {lens.focal_35mm_mm:g} mm on 35 mm film")
     usual = (_LEAST_PART * long_side, _MOST_PART * long_side)
-    return {name: each for name, each in found.items() if usual[0] < each[0] < usual[1]}
+    return {name: each for name, each in by_source.items() if usual[0] < each[0] < usual[1]}
 
 
 def _near(one: float, other: float) -> bool:
@@ -311,10 +315,10 @@ def camera_priors(
     for members in alike.values():
         serials = [serials_of(photo.tags) for photo in members]
         first: dict[int, int] = {}
-        for photo, own, number in zip(members, serials, grouped_by_serials(serials), strict=True):
+        for photo, serial, number in zip(members, serials, grouped_by_serials(serials), strict=True):
             if number not in first:
                 first[number] = len(cameras) + 1
-                cameras.append(_camera_prior(photo, len(cameras) + 1, own, given_focal_px, remarks))
+                cameras.append(_camera_prior(photo, len(cameras) + 1, serial, given_focal_px, remarks))
             camera_of[photo.name] = first[number]
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) > 1:
@@ -341,7 +345,7 @@ def _camera_prior(
     fisheye = fisheye_of(photo.tags, width, height)
     focal, source, origin = _focal(photo, fisheye)
     if given_focal_px is not None:
-        focal, origin = given_focal_px, "from --focal-px"
+        focal, origin = given_focal_px, "as the user states"
     kind = f" ({photo.sensor})" if photo.sensor else ""
     remarks.assume(
         "focal-length",
@@ -351,8 +355,8 @@ def _camera_prior(
     if fisheye is not None:
         remarks.assume(
             "fisheye-lens",
-            f"The lens of {name or 'the camera'}{kind} is a fisheye by its tags: COLMAP's OPENCV_FISHEYE is used, "
-            "whatever --camera-model says.",
+            f"The lens of {name or 'the camera'}{kind} is a fisheye by its tags: COLMAP's OPENCV_FISHEYE is used.",
+            "--camera-model does not apply to it.",
         )
     return CameraPrior(
         camera_id=number,
@@ -364,6 +368,6 @@ def _camera_prior(
         else (focal, focal, *centre, fisheye.k1, fisheye.k2, 0.0, 0.0),
         focal_source=source if given_focal_px is None else "option",
         make_model=name,
-        serial=serials.shown,
+        serial=serials.number,
         sensor=photo.sensor,
     )

@@ -33,7 +33,7 @@ def crs_of_table(table: PoseTable, options: IngestOptions, remarks: Remarks) -> 
     path = table.path
     if table.crs_text is not None:
         crs = parse_crs(table.crs_text, vertical=options.vertical, path=path, line=table.crs_line)
-        return _own(crs, path, options, remarks)
+        return _crs_of_file(crs, path, options, remarks)
     if options.crs is not None:
         crs = _given(options.crs, "--crs", table, options)
         if _excludes(crs, options):
@@ -49,11 +49,14 @@ def crs_of_table(table: PoseTable, options: IngestOptions, remarks: Remarks) -> 
     assumed = table.assumed_crs or (WGS84 if table.geographic else None)
     if assumed is None:
         raise InputError(
-            "crs-missing", "The columns x,y,z need a CRS. Give it with --crs, e.g. --crs EPSG:32632.", path=path
+            "crs-missing",
+            "The columns x,y,z need a CRS.",
+            path=path,
+            remedy="Give it with --crs, e.g. --crs EPSG:32632.",
         )
     what = "latitude and longitude" if table.geographic else "coordinates"
     remarks.assume("crs-assumed", f"The {what} in {path.name} are WGS84 ({assumed}).")
-    return _own(parse_crs(assumed, vertical=options.vertical), path, options, remarks)
+    return _crs_of_file(parse_crs(assumed, vertical=options.vertical), path, options, remarks)
 
 
 def crs_of_points(listed: GroundPoints, options: IngestOptions, remarks: Remarks) -> PointCrs:
@@ -65,20 +68,21 @@ def crs_of_points(listed: GroundPoints, options: IngestOptions, remarks: Remarks
     path = listed.path
     if listed.crs_text is not None:
         if options.gcp_crs is not None:
-            remarks.assume("gcp-crs-unused", f"{path.name} states its CRS: --gcp-crs does not apply to it.")
+            remarks.assume("gcp-crs-unused", f"{path.name} states its CRS.", "--gcp-crs does not apply to it.")
         crs = parse_crs(listed.crs_text, vertical=options.vertical, path=path, line=listed.crs_line)
-        return _own(crs, path, options, remarks)
+        return _crs_of_file(crs, path, options, remarks)
     if options.gcp_crs is not None:
         crs = _given(options.gcp_crs, "--gcp-crs", listed, options)
         _require_geoid(listed, crs, options)
         return crs
     if not listed.geographic:
-        message = f"{path.name} states no CRS. Give it, e.g. --gcp-crs EPSG:32632 or --gcp-crs EPSG:4326."
-        raise InputError("crs-missing", message, field="--gcp-crs")
+        message = f"{path.name} states no CRS."
+        remedy = "Give it, e.g. --gcp-crs EPSG:32632 or --gcp-crs EPSG:4326."
+        raise InputError("crs-missing", message, field="--gcp-crs", remedy=remedy)
     _require_geoid(listed, None, options)
     assumed = listed.assumed_crs or WGS84
     remarks.assume("crs-assumed", f"The latitude and longitude in {path.name} are WGS84 ({assumed}).")
-    return _own(parse_crs(assumed, vertical=options.vertical), path, options, remarks)
+    return _crs_of_file(parse_crs(assumed, vertical=options.vertical), path, options, remarks)
 
 
 def is_projected(text: str | None, flag: str) -> bool:
@@ -101,13 +105,20 @@ def in_units_of(crs: PointCrs, xyz: FloatArray, listed: PoseTable | GroundPoints
     Raises:
         InputError: the header states another unit of x and y than the CRS has.
     """
-    own = None if crs.is_geographic or crs.is_geocentric else crs.horizontal_unit
-    if listed.plan_unit_m is not None and own is not None and abs(listed.plan_unit_m / own - 1.0) > _ALIKE_UNITS:
+    crs_unit_m = None if crs.is_geographic or crs.is_geocentric else crs.horizontal_unit
+    if (
+        listed.plan_unit_m is not None
+        and crs_unit_m is not None
+        and abs(listed.plan_unit_m / crs_unit_m - 1.0) > _ALIKE_UNITS
+    ):
         raise InputError(
             "unit-against-crs",
-            f"The header says that x and y are in units of {listed.plan_unit_m:g} m, but {crs.name} counts in "
-            f"{crs.units[0]} ({own:g} m). Correct the header, or name the right CRS.",
+            (
+                f"The header says that x and y are in units of {listed.plan_unit_m:g} m, but {crs.name} counts "
+                f"in {crs.units[0]} ({crs_unit_m:g} m)."
+            ),
             path=listed.path,
+            remedy="Correct the header, or name the right CRS.",
         )
     if listed.height_unit_m is None:
         return xyz
@@ -119,10 +130,10 @@ def _require_geoid(listed: PoseTable | GroundPoints, crs: PointCrs | None, optio
     if listed.heights_above_geoid and options.vertical is None and not (crs is not None and crs.states_vertical):
         raise InputError(
             "geoid-not-named",
-            "The heights are above a geoid that the file does not name (geodetic, orthometric). Name it, e.g. "
-            "--vertical EGM96.",
+            "The heights are above a geoid that the file does not name (geodetic, orthometric).",
             path=listed.path,
             field="--vertical",
+            remedy="Name it, e.g. --vertical EGM96.",
         )
 
 
@@ -191,14 +202,13 @@ def note_operation(
     )
     if operation.sigma_m >= _LEAST_SIGMA_M:
         grids = ", ".join(operation.missing_grids)
-        better = (
-            f" A better one needs the PROJ grid {grids}: `pyproj sync --file NAME` installs it." if grids else ""
-        )
+        better = f" A better one needs the PROJ grid {grids}." if grids else ""
         remarks.caution(
             "transformation-accuracy",
             f"The {of} of {path.name} come from {crs.name} to WGS84 by “{operation.name}”, published with an "
             f"accuracy of {operation.accuracy_m:g} m: an error common to all of them, which the σ include, and "
             f"which points of the same CRS do not show.{better}",
+            "`pyproj sync --file NAME` installs it." if grids else "",
         )
     if operation.accuracy_m is None or operation.accuracy_m >= 0.5:
         accuracy = (
@@ -212,20 +222,22 @@ def note_operation(
         remarks.warn(
             "better-grid-missing",
             f"A better transformation of {crs.name} to WGS84 needs the PROJ grid "
-            f"{', '.join(operation.missing_grids)}. `pyproj sync --file NAME` installs it.",
+            f"{', '.join(operation.missing_grids)}.",
+            "`pyproj sync --file NAME` installs it.",
         )
     if crs.height_unit != "metre":
         remarks.assume("height-unit", f"Heights of {crs.name} are in {crs.height_unit}.")
 
 
-def _own(crs: PointCrs, path: Path, options: IngestOptions, remarks: Remarks) -> PointCrs:
+def _crs_of_file(crs: PointCrs, path: Path, options: IngestOptions, remarks: Remarks) -> PointCrs:
     """Return the CRS that a file has; what its name is read as, and an unused `--vertical`, are noted."""
     if crs.read_as is not None:
         remarks.assume("crs-by-name", f"The CRS {crs.name!r} of {path.name} is read as {crs.read_as}.")
     if _excludes(crs, options):
         remarks.assume(
             "vertical-unused",
-            f"Heights of {path.name} are {crs.vertical.name}, as its CRS says: --vertical does not apply to them.",
+            f"Heights of {path.name} are {crs.vertical.name}, as its CRS says.",
+            "--vertical does not apply to them.",
         )
     return crs
 

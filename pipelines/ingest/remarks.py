@@ -23,28 +23,28 @@ class Remarks:
         """Warnings, cautions and assumptions, in the order of `core.workspace.Summary`."""
         return self.warnings, self.cautions, self.assumptions
 
-    def assume(self, code: str, sentence: str) -> None:
+    def assume(self, code: str, sentence: str, remedy: str = "") -> None:
         """Record what stands in for what the input does not state."""
-        _add(self.assumptions, code, sentence)
+        add(self.assumptions, Remark(code=code, sentence=sentence, remedy=remedy))
 
-    def warn(self, code: str, sentence: str) -> None:
-        _add(self.warnings, code, sentence)
+    def warn(self, code: str, sentence: str, remedy: str = "") -> None:
+        add(self.warnings, Remark(code=code, sentence=sentence, remedy=remedy))
 
-    def caution(self, code: str, sentence: str) -> None:
+    def caution(self, code: str, sentence: str, remedy: str = "") -> None:
         """Record a limit of every result of this survey."""
-        _add(self.cautions, code, sentence)
+        add(self.cautions, Remark(code=code, sentence=sentence, remedy=remedy))
 
-    def warn_counted(self, code: str, items: Sequence[str], fault: str) -> None:
+    def warn_counted(self, code: str, items: Sequence[str], fault: str, remedy: str = "") -> None:
         """Record one warning for all items (files, or places as `file:line`), with their count and the first few.
 
         The fault is a sentence in the plural, without a full stop: "Empty images are left out".
         """
         if items:
-            self.warn(code, f"{fault} ({len(items)}): {shortened(items)}.")
+            self.warn(code, f"{fault} ({len(items)}): {shortened(items)}.", remedy)
 
 
-def _add(remarks: list[Remark], code: str, sentence: str) -> None:
-    remark = Remark(code=code, sentence=sentence)
+def add(remarks: list[Remark], remark: Remark) -> None:
+    """Append a remark, unless it was recorded before."""
     if remark not in remarks:
         remarks.append(remark)
 

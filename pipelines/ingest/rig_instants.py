@@ -14,16 +14,16 @@ from pathlib import Path, PurePosixPath
 
 from pipelines.core.errors import InputError
 from pipelines.formats.rig_config import read_rig_config
+from pipelines.ingest.options import ALL_SENSORS
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.sensors import VISIBLE, chosen_sensor, family_of, name_and_lens
 
-ALL = "all"  # of --sensor: the lenses that expose together
 Quaternion = tuple[float, float, float, float]
 _CAPTURES = ("CaptureUUID", "CaptureID", "CaptureUniqueID")
 _TOGETHER_S = 0.2  # by the time of exposure alone
 _TOGETHER_BY_NAME_S = 1.5  # where the name says so, too: clocks count whole seconds
-_FEWEST_INSTANTS = 3  # of a lens: fewer do not determine its place in the rig
+FEWEST_INSTANTS = 3  # of a lens: fewer do not determine its place in the rig
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def photos_of_rig(
         return photos, (), {}
     if config is not None:
         kept, found, rotations = _by_rig_file(photos, config)
-    elif sensor == ALL:
+    elif sensor == ALL_SENSORS:
         kept, rotations = chosen_sensor(photos, None, Remarks()), {}
         found = exposed_together(photos, kept)
     else:
@@ -56,11 +56,14 @@ def photos_of_rig(
     if not found:
         raise InputError(
             "no-rig",
-            "No lens was exposed together with the reference lens at three instants or more: neither identifiers "
-            "of captures, names nor times tell it. Give --rig with the names, or one sensor by --sensor.",
+            (
+                "No lens was exposed together with the reference lens at three instants or more: neither "
+                "identifiers of captures, names nor times tell it."
+            ),
             field="--sensor" if config is None else "--rig",
+            remedy="Give --rig with the names, or one sensor by --sensor.",
         )
-    _note_rig(photos, kept, found, remarks)
+    note_rig(photos, kept, found, remarks)
     return kept, found, rotations
 
 
@@ -113,7 +116,7 @@ def _sound(found: Iterable[Accompanying]) -> tuple[Accompanying, ...]:
     for each in found:
         single.setdefault((each.photo.sensor, each.beside), each)
     count = Counter(sensor for sensor, _ in single)
-    return tuple(each for (sensor, _), each in single.items() if count[sensor] >= _FEWEST_INSTANTS)
+    return tuple(each for (sensor, _), each in single.items() if count[sensor] >= FEWEST_INSTANTS)
 
 
 def _by_rig_file(
@@ -157,7 +160,7 @@ def _lens_name(prefix: str) -> str:
     return prefix.strip("/_-. ").casefold().replace("/", "-") or "lens"
 
 
-def _note_rig(
+def note_rig(
     photos: Sequence[Photo], reference: Sequence[Photo], found: Sequence[Accompanying], remarks: Remarks
 ) -> None:
     """Note the lenses of a rig, and warn of photographs of its other lenses that stay alone."""

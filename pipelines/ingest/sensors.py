@@ -65,11 +65,11 @@ _TOGETHER_S = 1.5  # between the lenses of a rig
 
 def with_sensors(photos: Sequence[Photo]) -> list[Photo]:
     """Return the photographs with the names of their sensors, empty where nothing tells one."""
-    found: dict[str, str] = {}
+    sensor_of: dict[str, str] = {}
     for rule in (_by_xmp, _by_suffix, _by_number, _by_size):
-        found |= rule([photo for photo in photos if photo.name not in found], photos)
-    found = _apart(photos, found)
-    return _alike([replace(photo, sensor=found.get(photo.name, "")) for photo in photos])
+        sensor_of |= rule([photo for photo in photos if photo.name not in sensor_of], photos)
+    sensor_of = _apart(photos, sensor_of)
+    return _alike([replace(photo, sensor=sensor_of.get(photo.name, "")) for photo in photos])
 
 
 def chosen_sensor(photos: Sequence[Photo], wanted: str | None, remarks: Remarks) -> list[Photo]:
@@ -83,24 +83,25 @@ def chosen_sensor(photos: Sequence[Photo], wanted: str | None, remarks: Remarks)
     counts = Counter(photo.sensor or VISIBLE for photo in photos)
     if wanted is None:
         kept = _of_family(photos, _default_family(counts))
-    elif (asked := _wanted(wanted, counts)) == VISIBLE:
+    elif (sensor_name := _wanted(wanted, counts)) == VISIBLE:
         kept = _of_family(photos, "visible")
     else:
-        kept = [photo for photo in photos if photo.sensor == asked]
+        kept = [photo for photo in photos if photo.sensor == sensor_name]
     used = {photo.name for photo in kept}
-    left: dict[str, list[str]] = {}
+    others: dict[str, list[str]] = {}
     for photo in photos:
         if photo.name not in used:
-            left.setdefault(photo.sensor or VISIBLE, []).append(photo.name)
-    if left:
+            others.setdefault(photo.sensor or VISIBLE, []).append(photo.name)
+    if others:
         chosen = Counter(photo.sensor or VISIBLE for photo in kept).items()
-        listed = "; ".join(f"{sensor} ({len(names)}), {_span(names)}" for sensor, names in left.items())
+        listed = "; ".join(f"{sensor} ({len(names)}), {_span(names)}" for sensor, names in others.items())
         remarks.warn(
             "other-sensors",
             f"The photographs are of {len(counts)} sensors, each with a lens of its own. Those of the sensor "
             f"{' and '.join(f'{sensor} ({count})' for sensor, count in chosen)} are used, and the others are left "
-            f"out: {listed}. Choose another with --sensor {'|'.join(left)}, or with --sensor all those that were "
-            "exposed together, as a rig.",
+            f"out: {listed}.",
+            f"Choose another with --sensor {'|'.join(others)}, or with --sensor all those that were exposed "
+            "together, as a rig.",
         )
     return kept
 
@@ -152,23 +153,24 @@ def _rank(name: str) -> tuple[int, str]:
 
 
 def _wanted(text: str, counts: Mapping[str, int]) -> str:
-    asked = _slug(text)
-    asked = _ALIASES.get(asked, asked)
-    if asked == VISIBLE and any(family_of(name) == "visible" for name in counts):
+    slug = _slug(text)
+    slug = _ALIASES.get(slug, slug)
+    if slug == VISIBLE and any(family_of(name) == "visible" for name in counts):
         return VISIBLE
     forms: tuple[Callable[[str], bool], ...] = (
-        lambda name: name == asked,
-        lambda name: re.fullmatch(rf"{re.escape(asked)}-[\d.]+", name) is not None,  # green of green-531
-        lambda name: asked.removesuffix("-nm").removesuffix("nm") in name.split("-"),  # 531 of green-531 or 531-nm
+        lambda name: name == slug,
+        lambda name: re.fullmatch(rf"{re.escape(slug)}-[\d.]+", name) is not None,  # green of green-531
+        lambda name: slug.removesuffix("-nm").removesuffix("nm") in name.split("-"),  # 531 of green-531 or 531-nm
     )
     for form in forms:
-        if len(found := [name for name in counts if form(name)]) == 1:
-            return found[0]
+        if len(matching := [name for name in counts if form(name)]) == 1:
+            return matching[0]
     listed = ", ".join(f"{name} ({count})" for name, count in counts.items())
     raise InputError(
         "no-such-sensor",
-        f"No photograph is of the sensor {text!r}. The folder has photographs of: {listed}. Give one of these.",
+        f"No photograph is of the sensor {text!r}. The folder has photographs of: {listed}.",
         field="--sensor",
+        remedy="Give one of these.",
     )
 
 
@@ -177,12 +179,12 @@ def _slug(text: str) -> str:
 
 
 def _by_xmp(photos: Sequence[Photo], _all: Sequence[Photo]) -> dict[str, str]:
-    found = {}
+    sensor_of = {}
     for photo in photos:
         sensor = _stated(photo)
         if sensor is not None:
-            found[photo.name] = sensor
-    return found
+            sensor_of[photo.name] = sensor
+    return sensor_of
 
 
 def _stated(photo: Photo) -> str | None:
@@ -238,7 +240,7 @@ def _by_suffix(photos: Sequence[Photo], everything: Sequence[Photo]) -> dict[str
             of_prefix.setdefault(prefix, set()).add(suffix)
     in_pairs = sum(len(suffixes) > 1 for suffixes in of_prefix.values()) > 1
     suffixes = set().union(*of_prefix.values()) if of_prefix else set()
-    found = {}
+    sensor_of = {}
     for photo in photos:
         prefix, suffix = parts[photo.name]
         sensor = _SUFFIXES.get(suffix)
@@ -247,8 +249,8 @@ def _by_suffix(photos: Sequence[Photo], everything: Sequence[Photo]) -> dict[str
             continue
         if suffix == "r" and not suffixes & {"g", "re", "nir"}:
             sensor = THERMAL  # FLIR's radiometric JPEG of DJI's Zenmuse XT
-        found[photo.name] = sensor
-    return found
+        sensor_of[photo.name] = sensor
+    return sensor_of
 
 
 def name_and_lens(name: str) -> tuple[str, str]:
@@ -291,18 +293,18 @@ def _by_size(photos: Sequence[Photo], _all: Sequence[Photo]) -> dict[str, str]:
         width, height = _sides(photo)
         shapes.setdefault(photo.tags.make_model, set()).add((width, round(width / height, 2)))
     widest = max((width for members in shapes.values() for width, _ in members), default=0)
-    found = {}
+    sensor_of = {}
     for photo in photos:
         width, height = _sides(photo)
         if (width, height) not in _THERMAL_SIZES or not widest > _MUCH_WIDER * width:
             continue
         parts = [part.casefold() for part in PurePosixPath(photo.name).parts]
-        told = "flir" in photo.tags.make_model.casefold() or _THERMAL_NAME.match(parts[-1]) is not None
-        told |= any(_ALIASES.get(part, part) == THERMAL for part in parts[:-1])
+        is_thermal = "flir" in photo.tags.make_model.casefold() or _THERMAL_NAME.match(parts[-1]) is not None
+        is_thermal |= any(_ALIASES.get(part, part) == THERMAL for part in parts[:-1])
         larger = {shape for wide, shape in shapes[photo.tags.make_model] if wide > _MUCH_WIDER * width}
-        if told or (photo.tags.make_model and larger and round(width / height, 2) not in larger):
-            found[photo.name] = THERMAL
-    return found
+        if is_thermal or (photo.tags.make_model and larger and round(width / height, 2) not in larger):
+            sensor_of[photo.name] = THERMAL
+    return sensor_of
 
 
 def _sides(photo: Photo) -> tuple[int, int]:
@@ -310,13 +312,13 @@ def _sides(photo: Photo) -> tuple[int, int]:
     return max(width, height), min(width, height)
 
 
-def _apart(photos: Sequence[Photo], found: Mapping[str, str]) -> dict[str, str]:
+def _apart(photos: Sequence[Photo], sensor_of: Mapping[str, str]) -> dict[str, str]:
     """Return the sensors, bands of one camera and name but of different wavelengths or lenses told apart."""
     members: dict[tuple[str, str], list[Photo]] = {}
     for photo in photos:
-        if family_of(found.get(photo.name, "")) == "band":
-            members.setdefault((photo.tags.make_model, found[photo.name]), []).append(photo)
-    result = dict(found)
+        if family_of(sensor_of.get(photo.name, "")) == "band":
+            members.setdefault((photo.tags.make_model, sensor_of[photo.name]), []).append(photo)
+    result = dict(sensor_of)
     readings: tuple[Callable[[Photo], str], ...] = (
         lambda photo: f"{photo.tags.xmp.number('CentralWavelength') or 0:.0f}",
         lambda photo: photo.tags.xmp.text("RigCameraIndex") or "",

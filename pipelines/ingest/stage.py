@@ -20,13 +20,12 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.ingest.bag_flight import count_frames, read_bag
 from pipelines.ingest.folder_flight import read_folder
-from pipelines.ingest.ground_points import ends_of, known_distances, read_ground_files, tie_marks
+from pipelines.ingest.ground_points import ShownMarks, ends_of, known_distances, read_ground_files, tie_marks
 from pipelines.ingest.masks import mask_files, write_masks
 from pipelines.ingest.options import IngestOptions, check_options
 from pipelines.ingest.photo_depth import with_common_scale
 from pipelines.ingest.photo_folder import convert_heif, glance, heif_photographs
 from pipelines.ingest.remarks import Remarks
-from pipelines.ingest.shown_marks import ShownMarks
 from pipelines.ingest.survey_assembly import assemble_survey, require_placed
 from pipelines.ingest.targets import find_targets, numbers_of_points
 from pipelines.ingest.video_frames import (
@@ -59,7 +58,7 @@ def run(stage: StageRun, options: IngestOptions) -> Summary:
     if track is not None:
         save_npz(stage.out / "track.npz", vars(track))
     for assumption in survey.assumptions:
-        log.info("assumed: %s", assumption.sentence)
+        log.info("assumed: %s", assumption.text)
     return _summary(survey)
 
 
@@ -96,8 +95,9 @@ def _refuse_inside_photographs(workspace: Workspace, options: IngestOptions) -> 
     if options.images is not None and workspace.root.resolve().is_relative_to(options.images.resolve()):
         raise InputError(
             "workspace-in-photographs",
-            "The workspace lies inside the folder of photographs. Choose another place.",
+            "The workspace lies inside the folder of photographs.",
             path=workspace.root,
+            remedy="Choose another place.",
         )
 
 
@@ -120,8 +120,8 @@ def survey_and_track(
     if options.estimated:
         remarks.assume(
             "rig-as-given",
-            f"{', '.join(options.estimated)}: the given value is used until `georef run` or `georef calibrate` "
-            "has estimated it after sfm.",
+            f"{', '.join(options.estimated)}: the given value is used until it is estimated after sfm.",
+            "`georef run` or `georef calibrate` estimates it.",
         )
     ground = read_ground_files(options, remarks)  # ahead of the photographs, which take minutes
     names = {point.name for file in ground if file is not None for point in file.points} | ends_of(options)
@@ -144,20 +144,21 @@ def survey_and_track(
     else:
         raise InputError(
             "no-photographs-given",
-            "Photographs are missing. Give their folder, a --bag or a --video.",
+            "Photographs are missing.",
             field="--images",
+            remedy="Give their folder, a --bag or a --video.",
         )
     sizes = {photo.name: (photo.file.width, photo.file.height) for photo in flight.photos}
     targets = (
         find_targets(flight.folder, tuple(sizes), options.targets, numbers, progress) if options.targets else None
     )
-    shown = ShownMarks({photo.name: photo.tags.orientation for photo in flight.photos}, options.marks_as_shown)
+    marking = ShownMarks({photo.name: photo.tags.orientation for photo in flight.photos}, options.marks_as_shown)
     control, check = (
-        None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks, targets, shown=shown)
+        None if file is None else tie_marks(file, sizes, options.sigma_mark, remarks, targets, marking=marking)
         for file in ground
     )
-    distances = known_distances(options, (control, check), sizes, remarks, targets, shown=shown)
-    shown.note(remarks)
+    distances = known_distances(options, (control, check), sizes, remarks, targets, marking=marking)
+    marking.note(remarks)
     if targets is not None:
         targets.note(remarks)
         if listing is not None:
@@ -166,11 +167,12 @@ def survey_and_track(
 
 
 def _copy_images(survey: Survey, stage: StageRun) -> None:
-    with stage.progress.task("copy", len(survey.images)) as task:
-        for image in survey.images:
-            target = stage.out / "images" / image.name
+    names = [image.name for image in survey.images] + [each.name for each in survey.companions]
+    with stage.progress.task("copy", len(names)) as task:
+        for name in names:
+            target = stage.out / "images" / name
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(Path(survey.image_dir) / image.name, target)
+            shutil.copyfile(Path(survey.image_dir) / name, target)
             task.advance()
 
 

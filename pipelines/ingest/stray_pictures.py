@@ -45,8 +45,8 @@ def with_sharpness(photos: Sequence[Photo]) -> list[Photo]:
         timed = all(photo.tags.timestamp_s is not None for photo in members)
         known = [photo for photo in members if photo.file.sharpness > 0.0]
         known.sort(key=lambda photo: (photo.tags.timestamp_s or 0.0) if timed else 0.0)  # else by name, as they are
-        for place, photo in enumerate(known):
-            sides = known[max(place - _AROUND, 0) : place], known[place + 1 : place + 1 + _AROUND]
+        for index, photo in enumerate(known):
+            sides = known[max(index - _AROUND, 0) : index], known[index + 1 : index + 1 + _AROUND]
             if sum(map(len, sides)) >= _LEAST_AROUND:
                 usual = min(np.median([one.file.sharpness for one in side]) for side in sides if side)
                 relative[photo.name] = float(photo.file.sharpness / usual)
@@ -79,9 +79,9 @@ def without_panoramas(photos: Sequence[Photo], remarks: Remarks) -> list[Photo]:
     if panoramas and len(panoramas) == len(photos):
         raise InputError(
             "only-panoramas",
-            f"All {len(photos)} pictures are stitched panoramas, which have no lens. Give the photographs that "
-            "they were made of, or perspective views cut out of them.",
+            f"All {len(photos)} pictures are stitched panoramas, which have no lens.",
             field="--images",
+            remedy="Give the photographs that they were made of, or perspective views cut out of them.",
         )
     remarks.warn_counted(
         "image-panorama", sorted(panoramas), "Stitched panoramas are no photographs of one lens, and are left out"
@@ -139,21 +139,25 @@ def _is_copy(small: Photo, large: Photo) -> bool:
     # A side is rounded to whole pixels, and the shape is known no better.
     if scale > 1 or abs(small.file.height - scale * large.file.height) > 1 + scale:
         return False
-    told, same_stem, likeness = _told(small, large), _stem(small) == _stem(large), _likeness(small, large)
-    if told is False:
+    same_exposure, same_stem, likeness = (
+        _is_same_exposure(small, large),
+        _stem(small) == _stem(large),
+        _likeness(small, large),
+    )
+    if same_exposure is False:
         return False
     if likeness is None:  # not decoded, or nothing to compare
-        return bool(same_stem and told and scale < 1)
+        return bool(same_stem and same_exposure and scale < 1)
     if scale == 1:
         return same_stem and likeness >= _SAME_SIZE
-    return likeness >= (_SAME if same_stem and told else _SURE)
+    return likeness >= (_SAME if same_stem and same_exposure else _SURE)
 
 
 def _stem(photo: Photo) -> str:
     return PurePosixPath(photo.name).stem.casefold()
 
 
-def _told(a: Photo, b: Photo) -> bool | None:
+def _is_same_exposure(a: Photo, b: Photo) -> bool | None:
     """Return whether the tags of two photographs tell one exposure; None: one of them has lost its tags."""
     equal: list[bool] = []
     if a.tags.make_model and b.tags.make_model:

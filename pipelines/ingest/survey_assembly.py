@@ -8,6 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Literal
 
 import numpy as np
@@ -22,9 +23,8 @@ from pipelines.ingest.ground_points import GroundFile, GroundPoint, require_near
 from pipelines.ingest.height_checks import SIGMA_DATUM_M, height_doubts, known_ground
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
-from pipelines.ingest.remarks import Remarks
-from pipelines.ingest.rolling_shutter import with_readouts, with_velocities
-from pipelines.ingest.tag_contents import contents
+from pipelines.ingest.readout_times import with_readouts, with_velocities
+from pipelines.ingest.remarks import Remarks, add
 from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, require_estimable
 from pipelines.survey.survey import (
     LOCAL_FRAME,
@@ -33,6 +33,8 @@ from pipelines.survey.survey import (
     Fix,
     FixSession,
     KnownDistance,
+    Original,
+    RigParameter,
     Survey,
     SurveyedPoint,
     SurveyImage,
@@ -78,18 +80,14 @@ def assemble_survey(
     _require_checks(checks, options.vegetated)
     marked, marked_checks = ([point for point in points if point.is_marked] for points in (controls, checks))
     unmarked = unmarked_points(controls, checks, remarks)
-    located = bool(poses.located.any())
-    if located:
-        middle_in_ecef = enu.ecef_from_lla(enu.median_lla(enu.lla_from_ecef(poses.position_in_ecef[poses.located])))
-        for file in files:
-            require_near(file, middle_in_ecef)
+    _require_near(files, poses)
     control_distances = sum(distance.use == "control" for distance in distances)
-    origin = None
-    if located or files or not control_distances:
-        require_placed(located or bool(marked), flight.photos, controls)
+    if poses.located.any() or files or not control_distances:
+        require_placed(bool(poses.located.any()) or bool(marked), flight.photos, controls)
         origin = _origin(poses, marked)
         _note_coverage(flight, len(marked), remarks)
     else:
+        origin = None
         remarks.caution(LOCAL_FRAME, _LOCAL_CAUTION.format(count=control_distances))
     if options.test_every and not _held_out(len(flight.photos), options.test_every):
         remarks.warn("no-test-images", f"{len(flight.photos)} images are too few to hold any out for testing.")
@@ -98,15 +96,10 @@ def assemble_survey(
         if flight.navigation is None or origin is None
         else flight_record.track_in_geo(flight.navigation, origin)
     )
-    estimated = options.estimated
-    if poses.coarse_times_m and track is not None and not options.time_offset_s:
-        # Only the photographs' own motion tells what coarse times leave open.
-        estimated = in_usual_order((*estimated, "time-offset"))
-    if options.estimated:
-        require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
+    estimated = _to_estimate(options, poses, track)
     doubts = height_doubts(flight, known_ground(files, options.ground_height, options.vertical, flight))
     for doubt in doubts:
-        remarks.caution(doubt.remark.code, doubt.remark.sentence)
+        add(remarks.cautions, doubt.remark)
     sigma_zero_m = max((doubt.sigma_m for doubt in doubts), default=0.0)
     sessions, session_of = fix_sessions(poses, options, remarks, sigma_zero_m=sigma_zero_m)
     of_control_m = _sigma_of_transformation(remarks, "control points")
@@ -121,6 +114,8 @@ def assemble_survey(
         image_dir=str(flight.folder),
         cameras=cameras,
         companions=_companions(flight),
+        original_dir=None if flight.original_folder is None else str(flight.original_folder),
+        originals=tuple(Original(name=name, sha256=sha256) for name, sha256 in flight.originals.items()),
         images=with_velocities(images, cameras, None if track is None else track.positions, options, remarks),
         sessions=sessions,
         control_points=_surveyed(marked, origin, options),
@@ -140,6 +135,28 @@ def assemble_survey(
     return survey, track
 
 
+def _require_near(files: Sequence[GroundFile], poses: flight_record.ImagePoses) -> None:
+    """Refuse files of points that are nowhere near the images."""
+    if poses.located.any():
+        middle_in_ecef = enu.ecef_from_lla(enu.median_lla(enu.lla_from_ecef(poses.position_in_ecef[poses.located])))
+        for file in files:
+            require_near(file, middle_in_ecef)
+
+
+def _to_estimate(
+    options: IngestOptions, poses: flight_record.ImagePoses, track: NavigationTrack | None
+) -> tuple[RigParameter, ...]:
+    """Return the parameters of the rig to estimate: those asked for, and what coarse times leave open.
+
+    Only the photographs' own motion tells the latter. An InputError: what is asked for was not recorded.
+    """
+    if options.estimated:
+        require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
+    if poses.coarse_times_m and track is not None and not options.time_offset_s:
+        return in_usual_order((*options.estimated, "time-offset"))
+    return options.estimated
+
+
 def require_placed(placed: bool, photos: Sequence[Photo] = (), points: Sequence[GroundPoint] = ()) -> None:
     """Refuse a survey that nothing places on Earth, with what its photographs' tags hold instead.
 
@@ -152,12 +169,17 @@ def require_placed(placed: bool, photos: Sequence[Photo] = (), points: Sequence[
         )
         raise InputError(
             "control-points-unmarked",
-            f"No image has a position, and no control point is marked in two or more photographs: of {len(points)} "
-            f"control points there are {of_each}. Mark each point in at least 2 photographs, better in all that "
-            "show it, or give positions with --trajectory or --geo.",
+            (
+                "No image has a position, and no control point is marked in two or more photographs: of "
+                f"{len(points)} control points there are {of_each}."
+            ),
+            remedy=(
+                "Mark each point in at least 2 photographs, better in all that show it, or give positions with "
+                "--trajectory or --geo."
+            ),
         )
     if not placed:
-        held = f" {contents(photos)}" if photos else ""
+        held = f" {_tag_contents(photos)}" if photos else ""
         raise InputError(
             "no-positions",
             f"No image has a position, and there are no ground control points.{held} Give --trajectory, --geo or "
@@ -183,9 +205,9 @@ def _require_checks(checks: Sequence[GroundPoint], vegetated: Sequence[str]) -> 
         if name not in known:
             raise InputError(
                 "vegetated-not-a-check",
-                f"{name!r} is no check point: there are {', '.join(sorted(known)) or 'none'}. Add it with "
-                "--checkpoints or --check.",
+                f"{name!r} is no check point: there are {', '.join(sorted(known)) or 'none'}.",
                 field="--vegetated",
+                remedy="Add it with --checkpoints or --check.",
             )
 
 
@@ -306,8 +328,8 @@ def _attitudes(
     if origin is not None:
         # Without a position, north is the origin's: within a survey it turns by minutes of arc.
         located = poses.located[rows, None]
-        place = np.where(located, enu.lla_from_ecef(poses.position_in_ecef[rows]), enu.lla_of(origin))
-        geo_from_cam = enu.geo_from_enu_at(place, origin) @ geo_from_cam
+        lla = np.where(located, enu.lla_from_ecef(poses.position_in_ecef[rows]), enu.lla_of(origin))
+        geo_from_cam = enu.geo_from_enu_at(lla, origin) @ geo_from_cam
     for row, quat in zip(rows, quat_xyzw_from_matrix(geo_from_cam), strict=True):
         x, y, z, w = (float(value) for value in quat)
         source = poses.attitude_source[row]
@@ -369,7 +391,8 @@ def fix_sessions(
         remarks.assume(
             "default-datum-sigma",
             f"Nobody stated the datum of the heights: the σ of the error that they share includes {datum_v_m:g} m "
-            "for it. State the datum with --vertical.",
+            "for it.",
+            "State the datum with --vertical.",
         )
     counts = np.bincount(session_of[located], minlength=len(sessions))
     for kind in flight_record.COMMON_SIGMA_M:
@@ -402,7 +425,8 @@ def _note_default(
         remarks.assume(
             "default-common-sigma",
             f"The error that the {count} positions of a session share has a σ of {', '.join(defaults.values())} "
-            f"({kind}). State it with {' and '.join(defaults)}.",
+            f"({kind}).",
+            f"State it with {' and '.join(defaults)}.",
         )
 
 
@@ -476,15 +500,52 @@ def _vertical(poses: flight_record.ImagePoses, files: Sequence[GroundFile], rema
     """Return the datum of the image positions, or of the control points if there are none; note all assumptions."""
     datums = {"the images": poses.vertical} if poses.located.any() else {}
     datums |= {file.path.name: file.crs.vertical for file in files}
-    for place, datum in datums.items():
+    for source, datum in datums.items():
         if not datum.stated:
-            remarks.assume("vertical-datum-assumed", f"Heights of {place} are {datum.name}: {datum.note}.")
-    stated = [place for place, datum in datums.items() if datum.stated]
-    assumed = [place for place, datum in datums.items() if not datum.stated]
+            remedy = "--vertical states their datum." if datum.is_assumed else ""
+            remarks.assume("vertical-datum-assumed", f"Heights of {source} are {datum.name}: {datum.note}.", remedy)
+    stated = [source for source, datum in datums.items() if datum.stated]
+    assumed = [source for source, datum in datums.items() if not datum.stated]
     if stated and assumed:
         remarks.warn(
             "vertical-datums-mixed",
             f"The vertical datum of {', '.join(stated)} is stated, that of {', '.join(assumed)} only assumed. "
-            "They may differ by a geoid's height, up to 100 m. State both with --vertical.",
+            "They may differ by a geoid's height, up to 100 m.",
+            "State both with --vertical.",
         )
     return next(iter(datums.values()))
+
+
+def _tag_contents(photos: Sequence[Photo]) -> str:
+    """Return a sentence on what the tags of photographs hold beside whole positions; empty if nothing."""
+    contents = []
+    models = sorted({photo.tags.make_model.strip() for photo in photos} - {""})
+    if models:
+        contents.append(f"the camera ({', '.join(models[:3])})")
+    flat = sum(photo.tags.gps is not None and photo.tags.gps.alt_m is None for photo in photos)
+    if flat:
+        contents.append(f"latitudes and longitudes without a height of {flat}")
+    times = [photo.tags.timestamp_s for photo in photos if photo.tags.timestamp_s is not None]
+    if times:
+        first, last = (
+            datetime.fromtimestamp(time, UTC).strftime("%Y-%m-%d %H:%M:%S") for time in (min(times), max(times))
+        )
+        contents.append(f"times of {len(times)} ({first} to {last})")
+    drone = [photo.tags.dji for photo in photos if photo.tags.dji is not None]
+    attitudes = sum(bool(tags.gimbal_yaw_pitch_roll_deg or tags.mount_yaw_pitch_roll_deg) for tags in drone)
+    if attitudes:
+        contents.append(f"attitudes of {attitudes}")
+    heights = [tags.relative_altitude_m for tags in drone if tags.relative_altitude_m is not None]
+    if heights:
+        contents.append(f"heights above take-off of {len(heights)} ({min(heights):.1f} to {max(heights):.1f} m)")
+    absolute = [tags.absolute_altitude_m for tags in drone if tags.absolute_altitude_m is not None]
+    if absolute:
+        contents.append(f"absolute altitudes of {len(absolute)} ({min(absolute):.1f} to {max(absolute):.1f} m)")
+    lenses = [photo.tags.lens for photo in photos]
+    if focal := sum(bool(lens.focal_mm or lens.focal_35mm_mm) for lens in lenses):
+        contents.append(f"focal lengths of {focal}")
+    problems = sorted({problem for photo in photos for problem in photo.tags.problems})
+    reasons = f" Not used: {'; '.join(problems[:3])}." if problems else ""
+    if not contents:
+        return f"Their tags hold no time, camera or attitude either.{reasons}"
+    return f"The tags of {len(photos)} photographs hold {', '.join(contents)}.{reasons}"

@@ -246,8 +246,9 @@ def _with_heights(table: PoseTable, photos: Sequence[Photo], crs: PointCrs, rema
     places = [f"{table.path.name}:{line}" for line in table.lines[~filled]]
     remarks.warn_counted("row-without-height", places, "Rows without a height are left out")
     if not filled.any():
-        message = "The file has no heights (z), and EXIF has none either. Add a column of heights."
-        raise InputError("no-heights", message, path=table.path)
+        message = "The file has no heights (z), and EXIF has none either."
+        remedy = "Add a column of heights."
+        raise InputError("no-heights", message, path=table.path, remedy=remedy)
     return replace(table, xyz=xyz).take(filled)
 
 

@@ -4,8 +4,9 @@ A gimbal's pitch is −90° where it looks down. The tags that PIX4D has defined
 and others, describe what the camera is mounted on: their pitch is 0° where it looks down.
 
 A gimbal that integrates its own turning may be off by a constant of each start, with the aircraft's compass right
-beside it. At nadir both state the same angle. Where they differ, the flight's own motion decides: an aircraft that
-flies nose first has the yaw of its track. Else the aircraft's yaw counts with a σ that covers both.
+beside it. At nadir both state the same angle, that of the image's upper edge: a gimbal's yaw and roll turn about
+nearly the same axis there, and only both together tell it. Where they differ, the flight's own motion decides: an
+aircraft that flies nose first has the yaw of its track. Else the aircraft's yaw counts with a σ that covers both.
 """
 
 from collections.abc import Sequence
@@ -15,11 +16,11 @@ import numpy as np
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.formats.exif import DjiTags
-from pipelines.geometry.rotations import geo_from_cam, geo_from_mounted_cam, log_so3
+from pipelines.geometry.rotations import exp_so3, geo_from_cam, geo_from_mounted_cam, log_so3
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
 
-_NADIR_DEG = -70.0  # pitch from which the gimbal's yaw is the aircraft's
+_NADIR_SINE = float(np.sin(np.radians(70.0)))  # of the view's dip from which the gimbal's heading is the aircraft's
 _APART_DEG = 15.0  # what compass, gimbal and turns explain
 _ALONG_DEG = 10.0
 _LEAST = 3
@@ -60,17 +61,19 @@ def tagged_attitudes(
         second = "EXIF's GPSImgDirection"
         directions = (photo.tags.direction_deg for photo in photos)
         aircraft = np.array([np.nan if one is None else one for one in directions])
-    headings = _Headings(angles[:, 0], aircraft, _track(lon_lat, time_s), _starts(time_s))
-    sigma_deg, nadir = np.full(len(photos), np.nan), _pitch_of_view(angles, mounted) <= _NADIR_DEG
-    starts = [headings.start == number for number in np.unique(headings.start)]
-    if any(_disagrees(headings, rows & nadir, _LEAST) for rows in starts):
-        for rows in starts:
-            if _disagrees(headings, rows & nadir, 1):
-                angles[rows, 0], sigma_deg[rows] = _of_start(headings, nadir, rows, second, remarks)
     enu_from_cam = np.full((len(photos), 3, 3), np.nan)
     known = np.isfinite(angles).all(axis=1)
     enu_from_cam[known & ~mounted] = geo_from_cam(angles[known & ~mounted])
     enu_from_cam[known & mounted] = geo_from_mounted_cam(angles[known & mounted])
+    headings = _Headings(_headings_deg(enu_from_cam), aircraft, _track(lon_lat, time_s), _starts(time_s))
+    sigma_deg, nadir = np.full(len(photos), np.nan), -enu_from_cam[:, 2, 2] >= _NADIR_SINE
+    starts = [headings.start == number for number in np.unique(headings.start)]
+    if any(_disagrees(headings, rows & nadir, _LEAST) for rows in starts):
+        for rows in starts:
+            if _disagrees(headings, rows & nadir, 1):
+                heading_deg, sigma_deg[rows] = _of_start(headings, nadir, rows, second, remarks)
+                clockwise_rad = np.radians(heading_deg - headings.gimbal[rows])
+                enu_from_cam[rows] = exp_so3(clockwise_rad[:, None] * [0.0, 0.0, -1.0]) @ enu_from_cam[rows]
     return TaggedAttitudes(enu_from_cam, np.where(mounted & np.isnan(sigma_deg), _SIGMA_DEG, sigma_deg))
 
 
@@ -104,10 +107,14 @@ def _angles(tags: Sequence[DjiTags], remarks: Remarks) -> tuple[FloatArray, Bool
     return np.where(of_gimbal[:, None], gimbal, mount), mounted & (not as_gimbal)
 
 
-def _pitch_of_view(angles: FloatArray, mounted: BoolArray) -> FloatArray:
-    """Return the pitch (N,) in degrees of the viewing axis by angles (N, 3) of gimbals or of mounts; −90: down."""
-    up = np.cos(np.radians(angles[:, 1])) * np.cos(np.radians(angles[:, 2]))
-    return np.where(mounted, -np.degrees(np.arcsin(np.clip(up, -1.0, 1.0))), angles[:, 1])
+def _headings_deg(enu_from_cam: FloatArray) -> FloatArray:
+    """Return the headings (N,) of images, clockwise from north, NaN without an attitude.
+
+    It is the direction of the image's upper edge where a camera looks down by more than 45°, else of its view.
+    """
+    down = -enu_from_cam[:, 2, 2] > np.sqrt(0.5)
+    east_north = np.where(down[:, None], -enu_from_cam[:, :2, 1], enu_from_cam[:, :2, 2])
+    return np.degrees(np.arctan2(east_north[:, 0], east_north[:, 1]))
 
 
 def _disagrees(headings: _Headings, rows: BoolArray, least: int) -> bool:

@@ -82,18 +82,18 @@ def tagged_positions(photos: Sequence[Photo], remarks: Remarks) -> TaggedPositio
     horizontal, heights = _sources(used), _height_sources(photos, used)
     if horizontal and "EXIF" not in horizontal:
         remarks.assume("positions-from-xmp", "EXIF has no position: those in XMP are used.")
-    place = _first(horizontal, len(photos), 2)
+    plan = _first(horizontal, len(photos), 2)
     for name in list(horizontal)[1:]:
-        place = _chosen_places(place, horizontal[name], (next(iter(horizontal)), name), flight)
+        plan = _chosen_places(plan, horizontal[name], (next(iter(horizontal)), name), flight)
     height = _first(heights, len(photos), 1)
     for name in list(heights)[1:]:
         height = _chosen_heights(height, heights[name], (next(iter(heights)), name), flight)
     zero, unknown = zero_heights(height.values[:, 0], names, "the photographs", remarks)
     height = replace(height, values=np.where(zero[:, None], np.nan, height.values))
     digits_h, digits_v = digits_sigma_m(
-        place.values, height.values[:, 0], degrees=True, of="the photographs", remarks=remarks
+        plan.values, height.values[:, 0], degrees=True, of="the photographs", remarks=remarks
     )
-    place_h = np.hypot(place.sigma_m, digits_h)
+    place_h = np.hypot(plan.sigma_m, digits_h)
     low = height.values[np.isfinite(height.values)]
     if len(low) and low.min() < 0.0:
         remarks.assume(
@@ -101,9 +101,9 @@ def tagged_positions(photos: Sequence[Photo], remarks: Remarks) -> TaggedPositio
             f"Heights of {low.min():.1f} to {low.max():.1f} m are below zero in part, as the tags say.",
         )
     return TaggedPositions(
-        xyz=np.column_stack([place.values[:, ::-1], height.values[:, 0]]),
+        xyz=np.column_stack([plan.values[:, ::-1], height.values[:, 0]]),
         sigma_m=np.column_stack([place_h, place_h, np.hypot(height.sigma_m, digits_v)]),
-        common_sigma_m=(math.hypot(place.common_m, datum_m), UNKNOWN_SIGMA_M if unknown else height.common_m),
+        common_sigma_m=(math.hypot(plan.common_m, datum_m), UNKNOWN_SIGMA_M if unknown else height.common_m),
     )
 
 
@@ -212,13 +212,13 @@ def _in_time(photos: Sequence[Photo]) -> list[int]:
     return sorted(range(len(photos)), key=lambda row: (times[row] or 0.0, row))
 
 
-def _chosen_places(place: _Choice, other: FloatArray, sources: tuple[str, str], flight: _Flight) -> _Choice:
+def _chosen_places(choice: _Choice, other: FloatArray, sources: tuple[str, str], flight: _Flight) -> _Choice:
     """Return the better of two sources of latitude and longitude (N, 2), by the rules of this module."""
     (one, two), names, remarks = sources, flight.names, flight.remarks
-    values = _filled(place.values, other, sources, "positions", remarks)
-    both = _known(place.values) & _known(other)
+    values = _filled(choice.values, other, sources, "positions", remarks)
+    both = _known(choice.values) & _known(other)
     if not both.any():
-        return replace(place, values=values)
+        return replace(choice, values=values)
     chosen, other = values.copy(), other.copy()
     for wrong, right, loser, winner in ((chosen, other, one, two), (other, chosen, two, one)):
         zero = both & (wrong == 0.0).any(axis=1) & (_metres(wrong, right) > _SLACK_M)
@@ -253,10 +253,10 @@ def _chosen_places(place: _Choice, other: FloatArray, sources: tuple[str, str], 
                 f"which are steps of {step[0] * M_PER_DEG:.2g} m. The positions in {two} are used.",
             )
             chosen[both] = other[both]
-        return replace(place, values=chosen)
+        return replace(choice, values=chosen)
     moves = [np.round((each[both] - each[both][0]) * _scale(each[both]), 3) for each in (chosen, other)]
     case = _Case(chosen, other, both, apart, allowed, one, two, "position", moves, _scale(chosen))
-    return _decided(case, place, flight)
+    return _decided(case, choice, flight)
 
 
 def _chosen_heights(height: _Choice, other: FloatArray, sources: tuple[str, str], flight: _Flight) -> _Choice:
@@ -403,13 +403,13 @@ def _decided(case: _Case, before: _Choice, flight: _Flight) -> _Choice:
 def _by_neighbours(case: _Case, differ: BoolArray, before: _Choice, flight: _Flight) -> _Choice:
     """Return the source that lies nearer to the line through the neighbours that agree, else a σ for both."""
     values, sigma_m, order = case.chosen.copy(), before.sigma_m.copy(), list(flight.order)
-    place = np.empty(len(order))
-    place[order] = np.arange(len(order))
+    rank = np.empty(len(order))
+    rank[order] = np.arange(len(order))
     good = np.flatnonzero(case.both & ~differ)
-    good = good[np.argsort(place[good])]
+    good = good[np.argsort(rank[good])]
     chosen: dict[str, list[str]] = {case.one: [], case.two: [], "neither": []}
     for row in np.flatnonzero(differ).tolist():
-        expected = [np.interp(place[row], place[good], axis) for axis in case.chosen[good].T]
+        expected = [np.interp(rank[row], rank[good], axis) for axis in case.chosen[good].T]
         off = [float(np.linalg.norm((each[row] - expected) * case.metres)) for each in (case.chosen, case.other)]
         winner = "neither" if min(off) > _DECISIVE * max(off) else (case.one, case.two)[int(off[1] < off[0])]
         chosen[winner].append(flight.names[row])

@@ -50,9 +50,9 @@ def numbers_of_points(names: Iterable[str], dictionaries: Sequence[str]) -> dict
         if other != name:
             raise InputError(
                 "target-number-ambiguous",
-                f"The tag {int(digits[0])} may be point {other} or point {name}: both names end in its number. "
-                "Rename one of them.",
+                (f"The tag {int(digits[0])} may be point {other} or point {name}: both names end in its number."),
                 field="--targets",
+                remedy="Rename one of them.",
             )
     return points
 
@@ -116,8 +116,9 @@ class Targets:
             places = " and ".join(f"{kind} ({image})" for kind, image in kinds.items())
             raise InputError(
                 "target-in-two-dictionaries",
-                f"Tags of {places} have the number of point {name}. Give --targets the one that was laid out.",
+                f"Tags of {places} have the number of point {name}.",
                 field="--targets",
+                remedy="Give --targets the one that was laid out.",
             )
         return tuple(marks)
 
@@ -127,8 +128,8 @@ class Targets:
         if not self.seen:
             remarks.warn(
                 "no-target-found",
-                "No photograph shows a tag of --targets. Is it another dictionary, or are the tags less than 20 "
-                "pixels wide?",
+                "No photograph shows a tag of the stated dictionary.",
+                "Is --targets another one, or are the tags less than 20 pixels wide?",
             )
         else:
             names = {self.points[self.seen[row].tag.number] for row in used}
@@ -193,8 +194,8 @@ def find_targets(
     look = partial(_tags_in, folder=folder, dictionaries=dictionaries, points=points)
     seen: list[SeenTag] = []
     with progress.task("targets", len(images)) as task, ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        for found in pool.map(look, images):
-            seen += found
+        for seen_in_image in pool.map(look, images):
+            seen += seen_in_image
             task.advance()
     return Targets(tuple(seen), points)
 
@@ -211,9 +212,9 @@ def _tags_in(image: str, folder: Path, dictionaries: Sequence[str], points: Mapp
         if not any(same):
             kept.append(tag)
     seen = []
-    for place, tag in enumerate(kept):
-        shown = place < _MOST_CHIPS_OF_IMAGE and tag.number in points
-        seen.append(SeenTag(image, tag, _chip(grey, tag) if shown else None))
+    for index, tag in enumerate(kept):
+        has_chip = index < _MOST_CHIPS_OF_IMAGE and tag.number in points
+        seen.append(SeenTag(image, tag, _chip(grey, tag) if has_chip else None))
     return seen
 
 

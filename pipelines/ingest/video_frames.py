@@ -65,7 +65,9 @@ def write_frames(
         (folder / names[-1]).write_bytes(jpeg.tobytes())
     if options.every is None:
         remarks.assume(
-            "video-every", f"The sharpest frame of every {_EVERY} of {video.name} is a photograph (--every)."
+            "video-every",
+            f"The sharpest frame of every {_EVERY} of {video.name} is a photograph.",
+            "--every sets another interval.",
         )
     return names, np.array(times)
 
@@ -76,8 +78,9 @@ def seconds_apart(options: IngestOptions) -> float:
     if every.unit != "s":
         raise InputError(
             "video-every-in-metres",
-            f"--every {every} counts metres, and a video has times alone. Give seconds, such as 1s.",
+            f"--every {every} counts metres, and a video has times alone.",
             field="--every",
+            remedy="Give seconds, such as 1s.",
         )
     return every.step
 
@@ -135,9 +138,10 @@ def _sharpest(video: Path, step_s: float, progress: Progress) -> Iterator[tuple[
         capture.release()
         raise InputError(
             "too-many-frames",
-            f"{count / rate / step_s:.0f} frames are due, {_MOST_FRAMES} at the most. Give a longer --every.",
+            f"{count / rate / step_s:.0f} frames are due, {_MOST_FRAMES} at the most.",
             path=video,
             field="--every",
+            remedy="Give a longer --every.",
         )
     best: tuple[float, float, ByteArray] | None = None
     interval, read = 0, 0

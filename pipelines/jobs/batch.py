@@ -83,13 +83,13 @@ class BatchTable(Product):
 def mission_row(mission: Mission, state: MissionState, end: JobEnd | None = None) -> MissionRow:
     """Return the row of a mission; it has figures if the mission has its result. Without an end, it did not run."""
     seconds = None if end is None else round(end.seconds, 3)
-    row = MissionRow(mission=mission.name, workspace=mission.place, state=state, seconds=seconds)
+    row = MissionRow(mission=mission.name, workspace=mission.relative_path, state=state, seconds=seconds)
     if state == "failed" and end is not None:
-        log = mission.workspace.root / "logs" / f"{end.place}.log"
+        log = mission.workspace.root / "logs" / f"{end.step}.log"
         return row.model_copy(
             update={
-                "failure": f"{end.place}: {end.error}" if end.place else end.error,
-                "log": f"{mission.place}/logs/{end.place}.log" if end.place and log.is_file() else None,
+                "failure": f"{end.step}: {end.error}" if end.step else end.error,
+                "log": f"{mission.relative_path}/logs/{end.step}.log" if end.step and log.is_file() else None,
             }
         )
     return row.model_copy(update=_figures(mission)) if state in ("done", "current") else row
@@ -110,7 +110,7 @@ def _figures(mission: Mission) -> dict[str, object]:
         "warnings": union(*(manifest.warnings for manifest in manifests.values())),
         "cautions": union(*cautions_by_stage(workspace).values()),
         "accuracy": headline_of(workspace),
-        "report": f"{mission.place}/{REPORT_PAGE}" if (workspace.root / REPORT_PAGE).is_file() else None,
+        "report": f"{mission.relative_path}/{REPORT_PAGE}" if (workspace.root / REPORT_PAGE).is_file() else None,
     }
     with contextlib.suppress(GeorefError):  # a mission may end before `evaluate`
         test = read_report(workspace.path(REPORT)).test_views
@@ -125,6 +125,7 @@ def _count(manifests: dict[str, Manifest], stage: str, name: str) -> int | None:
 
 
 def page_file(folder: Path, batch: str) -> Path:
+    """Return the path of a batch's page, beside its list."""
     return folder / f"{batch}.batch.html"
 
 
@@ -135,6 +136,7 @@ def write_batch(folder: Path, table: BatchTable) -> None:
 
 
 def batch_page(table: BatchTable) -> Page:
+    """Return the page of a batch: its table with links to the reports, failures, and remarks by mission."""
     links = {row.mission: quote(row.report) for row in table.missions if row.report is not None}
     remarks = [row for row in table.missions if row.warnings or row.cautions]
     failed = [row for row in table.missions if row.failure is not None]

@@ -51,7 +51,7 @@ def make_certificates(folder: Path) -> None:
             descriptor = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         except FileExistsError as error:
             raise InputError(
-                "certificate-exists", "exists. Delete it to make another.", path=folder / name
+                "certificate-exists", "exists.", path=folder / name, remedy="Delete it to make another."
             ) from error
         with os.fdopen(descriptor, "w", encoding="utf-8") as handle:
             handle.write(text)
@@ -79,8 +79,9 @@ def check_own_certificates(folder: Path) -> None:
             continue
         status = path.stat()
         if status.st_uid != os.geteuid():
-            message = "belongs to another user, who can run programs as you. Delete it."
-            raise InputError("key-of-another-user", message, path=path)
+            message = "belongs to another user, who can run programs as you."
+            remedy = "Delete it."
+            raise InputError("key-of-another-user", message, path=path, remedy=remedy)
         if status.st_mode & _OF_OTHERS:
             message = (
                 "is open to other users, who can run programs as you. If none of them has read or changed it: "
@@ -98,14 +99,18 @@ def check_certificates(folder: Path) -> None:
     """
     for name in (CERTIFICATE, KEY):
         if not (folder / name).is_file():
-            message = (
-                f"has no {name}. Name the folder of the cluster's certificate with --certificates. `georef cluster "
-                "certificates DIR` makes one; `georef cluster scheduler` makes yours for this machine."
+            message = f"has no {name}."
+            remedy = (
+                "Name the folder of the cluster's certificate with --certificates. `georef cluster certificates "
+                "DIR` makes one; `georef cluster scheduler` makes yours for this machine."
             )
-            raise InputError("certificate-missing", message, path=folder)
+            raise InputError("certificate-missing", message, path=folder, remedy=remedy)
     if os.name == "posix" and (folder / KEY).stat().st_mode & _OF_EVERYBODY:
         raise InputError(
-            "key-open", "can be read by every user of this machine. Close it with `chmod 600`.", path=folder / KEY
+            "key-open",
+            "can be read by every user of this machine.",
+            path=folder / KEY,
+            remedy="Close it with `chmod 600`.",
         )
     from cryptography import x509
 
@@ -227,7 +232,7 @@ def connected(cluster: ClusterAddress) -> Iterator[Client]:
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         hint = "" if not security else ", and whether it has the same certificate"
         raise ClusterError(
-            "no-scheduler", f"No scheduler answers at {cluster.url}. Check whether it runs{hint}."
+            "no-scheduler", f"No scheduler answers at {cluster.url}.", remedy=f"Check whether it runs{hint}."
         ) from error
     try:
         yield client

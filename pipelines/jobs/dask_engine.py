@@ -124,8 +124,8 @@ class ClusterRun:
                 self._finish(name, ProcessEnd(INTERRUPTED, time.monotonic() - attempt.since))
             raise ClusterError(
                 "scheduler-lost",
-                "The scheduler is lost; the jobs save their work and stop. Start scheduler and workers, then "
-                "repeat the command, which continues.",
+                "The scheduler is lost; the jobs save their work and stop.",
+                remedy="Start scheduler and workers, then repeat the command, which continues.",
             ) from error
         self._workers = {
             address: worker for address, worker in workers_of(described).items() if address not in self._unfit
@@ -266,7 +266,7 @@ class ClusterRun:
         attempt.display.close()
         if self.exchange is not None:
             self.exchange.collect(attempt.pending.job)
-        job_end = JobEnd(attempt.pending.job, end.code, end.seconds, attempt.display.place, end.error)
+        job_end = JobEnd(attempt.pending.job, end.code, end.seconds, attempt.display.step, end.error)
         tell_end(job_end)
         self.task.advance(left_s=math.inf)
         self.ended(job_end)

@@ -144,8 +144,8 @@ def run_scheduler(listen: ClusterAddress) -> None:
     from distributed.cli.dask_scheduler import main
 
     scheme = listen.url.partition(":")[0]
-    place = ("--protocol", scheme, "--host", listen.host, "--port", str(listen.port))
-    _call(main, [*place, *listen.dask_options(), *_PRIVATE_PAGES])
+    address_options = ("--protocol", scheme, "--host", listen.host, "--port", str(listen.port))
+    _call(main, [*address_options, *listen.dask_options(), *_PRIVATE_PAGES])
 
 
 def run_worker(

@@ -40,7 +40,7 @@ class JobEnd:
     job: Job
     code: int  # exit code; below zero the signal that ended the process
     seconds: float
-    place: str  # step that the job was at (`train`); empty if it named none
+    step: str  # that the job was at (`train`); empty if it named none
     error: str  # message of a job that failed, else empty
 
     @property
@@ -77,19 +77,19 @@ class Engine(Protocol):
 class JobDisplay(MessageReceiver):
     """Receiver of a job's messages: its tasks are one line, the outermost, with the task inside as its note.
 
-    Its place is the latest note of the outermost task: the stage that runs. Log records name the job, and only
+    Its step is the latest note of the outermost task: the stage that runs. Log records name the job, and only
     warnings are logged by default: many jobs say much.
     """
 
     def __init__(self, progress: Progress, name: str) -> None:
         super().__init__(self)
-        self.place = ""
+        self.step = ""
         self._shown_in, self._name = progress, name
         self._outer: ProgressTask | None = None
 
     def log(self, name: str, level: int, text: str) -> None:
-        shown = level if level >= logging.WARNING else logging.DEBUG
-        log.log(shown, "%s: %s", self._name, text)
+        shown_level = level if level >= logging.WARNING else logging.DEBUG
+        log.log(shown_level, "%s: %s", self._name, text)
 
     @contextmanager
     def task(self, name: str, total: int | None = None) -> Iterator[ProgressTask]:
@@ -104,8 +104,8 @@ class JobDisplay(MessageReceiver):
                 self._outer = None
 
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
-        self.place = note.strip() or self.place
-        self.show(steps, self.place)
+        self.step = note.strip() or self.step
+        self.show(steps, self.step)
 
     def show(self, steps: int, note: str) -> None:
         """Add steps to the line and change its note; the time that a job will still take is not known."""
@@ -121,15 +121,16 @@ class _InnerTask:
     def advance(self, steps: int = 1, note: str = "", left_s: float | None = None) -> None:
         self._done, self._note = self._done + steps, note.strip() or self._note
         count = f"{self._name} {self._done}" + ("" if self._total is None else f"/{self._total}")
-        left = "" if not left_s or math.isinf(left_s) else f"{duration(left_s)} left"
-        place = "" if self._name == self._line.place else self._line.place
-        self._line.show(0, " · ".join(filter(None, (place, count, self._note, left))))
+        remaining = "" if not left_s or math.isinf(left_s) else f"{duration(left_s)} left"
+        step = "" if self._name == self._line.step else self._line.step
+        self._line.show(0, " · ".join(filter(None, (step, count, self._note, remaining))))
 
 
 def tell_end(end: JobEnd) -> None:
+    """Log how a job ended: as information, as a warning if it was interrupted, as an error if it failed."""
     if end.is_done:
         log.info("%s: done (%s)", end.job.name, duration(end.seconds))
     elif end.is_interrupted:
-        log.warning("%s was interrupted at %s.", end.job.name, end.place or "its start")
+        log.warning("%s was interrupted at %s.", end.job.name, end.step or "its start")
     else:
-        log.error("%s failed%s. %s", end.job.name, f" at {end.place}" if end.place else "", end.error)
+        log.error("%s failed%s. %s", end.job.name, f" at {end.step}" if end.step else "", end.error)

@@ -1,8 +1,8 @@
 """Engine on this machine, the process of one job, and the engine in use, which the command line chooses.
 
 A process is this program again, which tells its progress, its log and its error as messages. Its crash is the end
-of its job, and of no other. It stops when its reader is gone (`georef_cli/verbosity.py`), so that no job outlives a
-killed parent for long.
+of its job, and of no other. It saves its work and ends when its reader is gone (`georef_cli/verbosity.py`), so that
+no job outlives a killed parent for long.
 """
 
 import json
@@ -169,7 +169,7 @@ class LocalEngine:
 
             def put(end: ProcessEnd) -> None:
                 display.close()
-                finished.put(JobEnd(job, end.code, end.seconds, display.place, end.error))
+                finished.put(JobEnd(job, end.code, end.seconds, display.step, end.error))
 
             return JobProcess(self.program, job.arguments, threads, display.take, put)
 

@@ -64,8 +64,9 @@ class Machine:
 
 
 def inspect_machine() -> Machine:
+    """Return what the machine offers: system, cores, memory in bytes, GPUs, backends and extras."""
     devices = range(torch.cuda.device_count() if torch.cuda.is_available() else 0)
-    found = (torch.cuda.get_device_properties(index) for index in devices)
+    gpus = (torch.cuda.get_device_properties(index) for index in devices)
     return Machine(
         system=f"{platform.system()} {platform.release()} {platform.machine()}",
         python=platform.python_version(),
@@ -73,7 +74,7 @@ def inspect_machine() -> Machine:
         threads=thread_count(),
         memory_bytes=total_main_memory_bytes(),
         free_bytes=free_memory_bytes(torch.device("cpu")),
-        gpus=tuple(Gpu(properties.name, int(properties.total_memory)) for properties in found),
+        gpus=tuple(Gpu(properties.name, int(properties.total_memory)) for properties in gpus),
         backends=tuple(_backend(name) for name in BACKENDS),
         extras=tuple(map(extra_part, EXTRAS)),
         sizes_mb={"core": CORE_MB} | {str(name): size for name, size in SIZES_MB.items()},

@@ -43,7 +43,7 @@ class Mission:
 
     name: str  # unique in the batch, and a name of a folder
     workspace: Workspace  # which may not exist yet
-    place: str  # its path, relative to the folder of the batch
+    relative_path: str  # of its workspace, relative to the folder of the batch
     last: str | None = None  # last stage to run; None: all
     deliver: str | None = None  # as for `georef run --deliver`
     flags: Mapping[str, Flags] = field(default_factory=dict, hash=False)  # by stage and field
@@ -97,7 +97,7 @@ def _merged(flags: Mapping[str, Flags], more: Mapping[str, Flags]) -> dict[str, 
 def _in_folder(folder: Path) -> MissionList:
     """Return the missions of a folder: its folders with photographs, with `georef.toml`, or begun before."""
     signs = (USUAL_INPUTS["images"], CONFIG_FILE, REQUESTS)
-    found = []
+    missions = []
     for root in sorted(folder.iterdir()):
         if root.name.startswith(".") or not root.is_dir() or not any((root / sign).exists() for sign in signs):
             continue
@@ -115,8 +115,8 @@ def _in_folder(folder: Path) -> MissionList:
         }
         if "bag" in known:
             usual.pop("images", None)
-        found.append(Mission(root.name, workspace, root.name, flags={"ingest": usual}))
-    return MissionList(folder.resolve().name, folder, tuple(found))
+        missions.append(Mission(root.name, workspace, root.name, flags={"ingest": usual}))
+    return MissionList(folder.resolve().name, folder, tuple(missions))
 
 
 def _in_file(path: Path, owners: Owners) -> MissionList:
@@ -140,7 +140,7 @@ def _in_file(path: Path, owners: Owners) -> MissionList:
 
 @dataclass(frozen=True)
 class _Settings:
-    own: Mapping[str, str]
+    texts: Mapping[str, str]
     flags: Mapping[str, Flags]
 
 
@@ -155,13 +155,14 @@ class _Table:
     def read(self, table: Any) -> _Settings:
         """Return the content of the table, or raise an InputError for an unknown key or a bad value."""
         if not isinstance(table, dict):
-            message = f"is not a table. Write [{self.name}], and its options below."
-            raise InputError("not-a-table", message, path=self.path, field=self.name)
-        own: dict[str, str] = {}
+            message = "is not a table."
+            remedy = f"Write [{self.name}], and its options below."
+            raise InputError("not-a-table", message, path=self.path, field=self.name, remedy=remedy)
+        texts: dict[str, str] = {}
         flags: dict[str, dict[str, Any]] = {}
         for key, value in table.items():
             if key in _OWN_KEYS:
-                own[key] = self._own(key, value)
+                texts[key] = self._mission_text(key, value)
             elif key in BY_NAME:
                 if not isinstance(value, dict):
                     raise self._error("not-a-table", key, "is not a table of options.")
@@ -176,9 +177,9 @@ class _Table:
                 known = ", ".join((*_OWN_KEYS, *self.owners))
                 message = f"is unknown. The keys are {known}, and the tables of stages: {', '.join(BY_NAME)}."
                 raise self._error("unknown-option", key, message)
-        return _Settings(own, flags)
+        return _Settings(texts, flags)
 
-    def _own(self, key: str, value: Any) -> str:
+    def _mission_text(self, key: str, value: Any) -> str:
         if not isinstance(value, str):
             raise self._error("not-a-text", key, "is not a text.")
         try:
@@ -219,19 +220,21 @@ class _Table:
 def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Owners) -> Mission:
     label = f"missions.{name}"
     _require_name(name, path, label)
-    own = _Table(path, label, owners).read(table)
-    settings = {**defaults.own, **own.own}
-    flags = _merged(defaults.flags, own.flags)
+    stated = _Table(path, label, owners).read(table)
+    settings = {**defaults.texts, **stated.texts}
+    flags = _merged(defaults.flags, stated.flags)
     for stage, given in flags.items():
         try:
             BY_NAME[stage].options.model_validate(given)
         except ValidationError as error:
             sentence = fault_sentence(error.errors()[0])
             raise InputError("option-invalid", sentence, path=path, field=f"{label}.{stage}") from error
-    place = own.own.get("workspace", f"{defaults.own['workspace']}/{name}" if "workspace" in defaults.own else name)
-    root = path.parent.absolute() / place
+    relative_path = stated.texts.get(
+        "workspace", f"{defaults.texts['workspace']}/{name}" if "workspace" in defaults.texts else name
+    )
+    root = path.parent.absolute() / relative_path
     _require_inside(root, path.parent, path, label)
-    mission = Mission(name, Workspace(root), place, settings.get("to"), settings.get("deliver"), flags)
+    mission = Mission(name, Workspace(root), relative_path, settings.get("to"), settings.get("deliver"), flags)
     running = {spec.name for spec in mission.stages}
     for key in table:
         stages = (key,) if key in BY_NAME else owners.get(key, ())
@@ -243,8 +246,9 @@ def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Own
 
 def _require_name(name: str, path: Path, label: str) -> None:
     if not _NAME.fullmatch(name):
-        message = "cannot be the name of a mission. Use letters, digits, '.', '-' and '_'."
-        raise InputError("mission-name", message, path=path, field=label)
+        message = "cannot be the name of a mission."
+        remedy = "Use letters, digits, '.', '-' and '_'."
+        raise InputError("mission-name", message, path=path, field=label, remedy=remedy)
 
 
 def _require_inside(root: Path, folder: Path, path: Path, label: str) -> None:
@@ -258,11 +262,11 @@ def _require_own_workspaces(path: Path, missions: Sequence[Mission]) -> None:
     """Refuse two missions in one workspace; some file systems do not tell capitals from small letters."""
     taken: dict[str, str] = {}
     for mission in missions:
-        place = str(mission.workspace.root.resolve()).casefold()
-        if place in taken:
-            message = f"is the workspace of {taken[place]} too. Each mission needs its own."
+        root = str(mission.workspace.root.resolve()).casefold()
+        if root in taken:
+            message = f"is the workspace of {taken[root]} too. Each mission needs its own."
             raise InputError("workspace-shared", message, path=path, field=f"missions.{mission.name}.workspace")
-        taken[place] = mission.name
+        taken[root] = mission.name
 
 
 def _texts(value: Any) -> Iterator[str]:

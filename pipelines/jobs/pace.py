@@ -1,4 +1,4 @@
-"""Time of every stage: a rough model, times what this machine's own runs took, kept in the user's cache.
+"""Correction of the cost model by what this machine's own runs took, kept in the user's cache.
 
 Each run of a stage that was alone on the machine leaves its time over the model's, by processor and threads; the
 median of the last runs corrects the next estimate. A machine whose cores others use teaches nothing, and is named.
@@ -19,26 +19,6 @@ from pipelines.core.machine import thread_count, user_cache
 
 log = logging.getLogger(__name__)
 
-# Seconds on two cores: of a run, of a photograph, and of a megapixel of the photographs as they are trained. `sfm`
-# and `train` have models of their own; these are rough, and the first run on a machine corrects them.
-_MODELS: dict[str, tuple[float, float, float]] = {
-    "ingest": (0.2, 0.01, 0.0),
-    "calibrate": (0.2, 0.006, 0.0),
-    "geolocate": (0.1, 0.007, 0.0),
-    "init-sim3": (0.3, 0.03, 0.0),
-    "evaluate": (3.0, 0.1, 1.5),
-    "export-ply": (0.1, 0.0, 0.01),
-    "export-measurable": (3.0, 0.1, 4.0),
-    "export-raster": (4.0, 0.2, 4.0),
-    "export-cloud": (2.0, 0.1, 2.0),
-    "export-mesh": (4.0, 0.2, 5.0),
-    "export-spz": (0.5, 0.0, 0.05),
-    "export-tiles": (1.0, 0.0, 0.2),
-    "export-html": (1.0, 0.0, 0.1),
-    "export-cameras": (1.0, 0.02, 0.0),
-    "export-opf": (1.0, 0.02, 0.0),
-    "report": (2.5, 0.05, 0.0),
-}
 _KEPT = 5  # runs of a stage
 _MOST, _LEAST = 100.0, 0.01  # ratio, beyond which a file is damaged
 _SHORTEST_S = 0.2  # of a run that says something
@@ -52,14 +32,6 @@ class Ticks:
     total: int
     idle: int
     steal: int
-
-
-def modelled_s(stage: str, photographs: int, megapixels: float) -> float | None:
-    """Return the modelled seconds of a stage for photographs of so many megapixels in all; None: no model."""
-    model = _MODELS.get(stage)
-    if model is None:
-        return None
-    return model[0] + model[1] * photographs + model[2] * megapixels
 
 
 def corrected(stage: str, modelled: float) -> float:
@@ -97,11 +69,12 @@ def used_by_others(before: Ticks | None, own_s: float) -> float:
     if before is None or after is None or after.total <= before.total:
         return 0.0
     busy = (after.total - after.idle) - (before.total - before.idle)
-    own = own_s * os.sysconf("SC_CLK_TCK")
-    return max(busy - own, 0.0) / (after.total - before.total)
+    own_ticks = own_s * os.sysconf("SC_CLK_TCK")
+    return max(busy - own_ticks, 0.0) / (after.total - before.total)
 
 
 def is_loaded(share: float) -> bool:
+    """Return whether others used so large a share (0 to 1) of the processors that a measured speed tells little."""
     return share > _BUSY
 
 
@@ -139,10 +112,10 @@ def _file() -> Path:
 def _document() -> dict[str, dict[str, list[float]]]:
     """Return the kept ratios by machine and stage; none of a file that is missing or damaged."""
     try:
-        found = json.loads(_file().read_text(encoding="utf-8"))
+        document = json.loads(_file().read_text(encoding="utf-8"))
         return {
             str(key): {str(stage): [float(ratio) for ratio in ratios] for stage, ratios in stages.items()}
-            for key, stages in found.items()
+            for key, stages in document.items()
         }
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):
         return {}

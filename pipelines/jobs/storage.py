@@ -79,18 +79,20 @@ class Storage:
         """Return the index of a part, or None; an InputError: it is damaged, or leads out of its part."""
         with self._reached():
             store, home = self._place(part)
-            place = f"{home}.json"
-            if not store.exists(place):
+            url = f"{home}.json"
+            if not store.exists(url):
                 return None
-            if store.size(place) > _MOST_INDEX_BYTES:
-                raise InputError("file-too-large", "is too large for an index.", path=place)
+            if store.size(url) > _MOST_INDEX_BYTES:
+                raise InputError("file-too-large", "is too large for an index.", path=url)
             try:
-                index = PartIndex.model_validate_json(store.cat_file(place))
+                index = PartIndex.model_validate_json(store.cat_file(url))
             except ValidationError as error:
                 message = f"is a damaged index. {fault_sentence(error.errors()[0])} Delete it."
-                raise InputError("index-damaged", message, path=place) from error
+                raise InputError("index-damaged", message, path=url) from error
             if index.part != part or not all(name == "." or stays_inside(name) for name in index.files):
-                raise InputError("index-leaves-part", "lists files outside its part. Delete it.", path=place)
+                raise InputError(
+                    "index-leaves-part", "lists files outside its part.", path=url, remedy="Delete it."
+                )
             return index
 
     def send(self, folder: Path, part: str, writer: Writer, attempt: str = "") -> PartIndex:
@@ -122,9 +124,9 @@ class Storage:
             if index != before:
                 self.write_index(index)
                 wanted = set(keys.values())
-                for place in store.ls(home, detail=False):
-                    if place.rpartition("/")[2] not in wanted:
-                        store.rm_file(place)
+                for url in store.ls(home, detail=False):
+                    if url.rpartition("/")[2] not in wanted:
+                        store.rm_file(url)
             return index
 
     def fetch(self, folder: Path, part: str, before: PartIndex | None = None) -> PartIndex | None:
@@ -204,8 +206,8 @@ def _files_of(path: Path) -> Iterator[tuple[str, tuple[int, int]]]:
 
 def _is_older(path: Path, state: tuple[int, int]) -> bool:
     """Return whether a file is missing, or older than a state or of another size."""
-    own = _state_of(path)
-    return own is None or (own != state and own[1] <= state[1])
+    present = _state_of(path)
+    return present is None or (present != state and present[1] <= state[1])
 
 
 def _state_of(path: Path) -> tuple[int, int] | None:
@@ -257,8 +259,9 @@ class EngineExchange:
             InputError: the job names no parts, or a part lies outside its folder.
         """
         if job.folder is None or job.writes is None:
-            message = f"is not supported by {job.name}, whose files are not known. Use a shared folder."
-            raise InputError("storage-not-supported", message, field="--storage")
+            message = f"is not supported by {job.name}, whose files are not known."
+            remedy = "Use a shared folder."
+            raise InputError("storage-not-supported", message, field="--storage", remedy=remedy)
         folder = job.folder.resolve()
         writes, *reads = [_part(folder, path) for path in (job.writes, *job.reads)]
         self._collect(folder, writes)

@@ -8,10 +8,10 @@ import numpy as np
 from pipelines.core.figures import CELLS, ERRORS, WAYS, Figure
 from pipelines.core.stages import ACCURACY_MAP
 from pipelines.core.types import FloatArray
+from pipelines.core.workspace import Workspace
 from pipelines.report.page import Picture, picture_of_png, png_file
 from pipelines.report.plots.observations import predicted_against_measured
-from pipelines.report.views import EvaluatedSurvey
-from pipelines.survey.report import CheckPointErrors, PredictedPointError
+from pipelines.survey.report import CheckPointErrors, EvaluationReport, PredictedPointError
 from pipelines.survey.survey import SurveyedPoint
 
 # Of a circular normal distribution in plan, and of a normal one in height, both without bias: 90 % lie within.
@@ -60,10 +60,12 @@ class AccuracyFacts:
     quantile_points: int = _LEAST_FOR_QUANTILE  # fewest points with an empirical quantile
 
 
-def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
-    report = evaluated.report
+def accuracy_facts(
+    workspace: Workspace, report: EvaluationReport, check_points: tuple[SurveyedPoint, ...]
+) -> AccuracyFacts:
+    """Return what the section on accuracy shows: errors beside predicted σ (metres), and their shares within σ."""
     by_way = report.checkpoints.by_way
-    sigma, error = _compared(report.checkpoints.triangulated, evaluated.solved.survey.check_points)
+    sigma, error = _compared(report.checkpoints.triangulated, check_points)
     enough = len(sigma) >= _LEAST_FOR_CHART
     within: list[tuple[str, float, float]] = []
     for name, ratio in zip(("horizontal", "vertical"), (error / np.maximum(sigma, 1e-12)).T, strict=True):
@@ -80,12 +82,12 @@ def accuracy_facts(evaluated: EvaluatedSurvey) -> AccuracyFacts:
         ways={way: WAYS[way] for way, errors in by_way.items() if errors.count},
         chart=picture_of_png(predicted_against_measured(sigma, error)) if enough else None,
         within=tuple(within),
-        map=png_file(evaluated.workspace.root / ACCURACY_MAP),
+        map=png_file(workspace.root / ACCURACY_MAP),
         surface="surface" in by_way,
         crossed=crossed is not None and crossed.count > 0,
         crossed_reason="" if crossed is None or crossed.reason is None else crossed.reason,
         crossed_figures=_lines("cross_validation.", _CROSSED),
-        check_points=len(evaluated.solved.survey.check_points),
+        check_points=len(check_points),
     )
 
 

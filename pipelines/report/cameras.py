@@ -5,17 +5,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.adjust.posterior import Posterior
 from pipelines.core.products import is_checked
 from pipelines.core.types import BoolArray, FloatArray, vector3
 from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, parameters_in
+from pipelines.geometry.network import Network
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.place import Texts, heads_of, map_coordinates, texts_of
 from pipelines.report.plots.observations import correlation_matrix, fix_series, residual_field
 from pipelines.report.plots.plans import movement_plan
-from pipelines.report.views import EvaluatedSurvey
+from pipelines.report.views import reprojection_residuals
 from pipelines.survey.headline import NOTHING_CHECKS
+from pipelines.survey.solution import FixDifferences, Solution, fix_differences
 from pipelines.survey.survey import FixSession, Survey
-from pipelines.survey.trained_survey import FixDifferences, fix_differences
+from pipelines.survey.target_crs import TargetCrs
 
 
 @dataclass(frozen=True)
@@ -76,33 +79,33 @@ class CamerasFacts:
     axes: Texts  # names of the coordinates with their units
 
 
-def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
-    solved, checked = evaluated.solved, is_checked(evaluated.solved.model.cautions)
-    fixes = fix_differences(solved)
-    names, registered = solved.sparse.image_name, set(solved.sparse.image_name)
+def cameras_facts(survey: Survey, posterior: Posterior, crs: TargetCrs) -> CamerasFacts:
+    """Return what the section on cameras shows: residuals of the fixes, and σ of position and attitude."""
+    solution, names = posterior.solution, posterior.sparse.image_name
+    checked, fixes, registered = is_checked(solution.cautions), fix_differences(solution, survey), set(names)
     moved = np.full((len(names), 3), np.nan)
     is_outlier: BoolArray = np.zeros(len(names), dtype=bool)
     moved[fixes.camera], is_outlier[fixes.camera] = fixes.difference_in_geo, fixes.is_outlier
-    covariance = evaluated.posterior.camera_cov[:, 3:, 3:] if checked else None
+    covariance = posterior.camera_cov[:, 3:, 3:] if checked else None
     drawn = movement_plan(
-        evaluated.center_in_geo[:, :2],
+        solution.center_in_geo[:, :2],
         moved[:, :2],
         None if covariance is None else covariance[:, :2, :2],
         is_outlier,
-        map_coordinates(evaluated.crs),
+        map_coordinates(crs),
     )
-    by_name = {image.name: image.fix for image in solved.survey.images}
+    by_name = {image.name: image.fix for image in survey.images}
     stated = [fix.cov_apart for camera in fixes.camera if (fix := by_name[names[camera]]) is not None]
     # Stated σ (F, 3) along east, north and up, without the error that a session shares.
     stated_m = np.asarray(np.sqrt(np.diagonal(np.array(stated).reshape(-1, 3, 3), axis1=1, axis2=2)))
-    series, by_time = _series(evaluated, fixes, stated_m)
+    series, by_time = _series(survey, names, fixes, stated_m)
     sigma_m = None if covariance is None else np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return CamerasFacts(
-        photographs=len(solved.survey.images),
+        photographs=len(survey.images),
         registered=len(names),
-        unregistered=tuple(image.name for image in solved.survey.images if image.name not in registered),
+        unregistered=tuple(image.name for image in survey.images if image.name not in registered),
         fixes=len(fixes.camera),
-        sessions=tuple(dict.fromkeys(solved.survey.sessions)),
+        sessions=tuple(dict.fromkeys(survey.sessions)),
         map=picture_of_png(drawn.png),
         arrow_factor=drawn.arrow_factor,
         ellipse_factor=drawn.ellipse_factor,
@@ -120,8 +123,8 @@ def cameras_facts(evaluated: EvaluatedSurvey) -> CamerasFacts:
         largest_fix=_largest(fixes, stated_m, names),
         median_sigma_h_m=None if sigma_m is None else float(np.median(np.hypot(sigma_m[:, 0], sigma_m[:, 1]))),
         median_sigma_v_m=None if sigma_m is None else float(np.median(sigma_m[:, 2])),
-        rows=_rows(evaluated, moved, is_outlier, sigma_m),
-        axes=heads_of(evaluated.crs),
+        rows=_rows(solution, survey, crs, moved, is_outlier, sigma_m=sigma_m),
+        axes=heads_of(crs),
     )
 
 
@@ -150,11 +153,12 @@ def bias_of(fixes: FixDifferences, stated_m: FloatArray) -> tuple[FlightBias, ..
     )
 
 
-def _series(evaluated: EvaluatedSurvey, fixes: FixDifferences, stated_m: FloatArray) -> tuple[Picture | None, bool]:
+def _series(
+    survey: Survey, names: Sequence[str], fixes: FixDifferences, stated_m: FloatArray
+) -> tuple[Picture | None, bool]:
     """Return the picture of the residuals in time, and whether the times are known."""
     if not len(fixes.camera):
         return None, False
-    survey, names = evaluated.solved.survey, evaluated.solved.sparse.image_name
     by_name = {image.name: image for image in survey.images}
     images = [by_name[names[camera]] for camera in fixes.camera]
     known = [image.timestamp_s for image in images if image.timestamp_s is not None]
@@ -165,13 +169,19 @@ def _series(evaluated: EvaluatedSurvey, fixes: FixDifferences, stated_m: FloatAr
 
 
 def _rows(
-    evaluated: EvaluatedSurvey, moved: FloatArray, is_outlier: BoolArray, sigma_m: FloatArray | None
+    solution: Solution,
+    survey: Survey,
+    crs: TargetCrs,
+    moved: FloatArray,
+    is_outlier: BoolArray,
+    *,
+    sigma_m: FloatArray | None,
 ) -> tuple[CameraRow, ...]:
-    center, crs = evaluated.center_in_geo, evaluated.crs
+    center = solution.center_in_geo
     adjusted = texts_of(crs, center)
     has_fix = np.atleast_1d(np.isfinite(moved).all(axis=1))
     measured = dict(zip(np.flatnonzero(has_fix).tolist(), texts_of(crs, (center - moved)[has_fix]), strict=True))
-    sha256 = {image.name: image.sha256 for image in evaluated.solved.survey.images}
+    sha256 = {image.name: image.sha256 for image in survey.images}
     return tuple(
         CameraRow(
             name=camera.name,
@@ -182,7 +192,7 @@ def _rows(
             sigma_m=None if sigma_m is None else vector3(sigma_m[index]),
             sha256=sha256.get(camera.name, ""),
         )
-        for index, camera in enumerate(evaluated.solved.model.cameras)
+        for index, camera in enumerate(solution.cameras)
     )
 
 
@@ -232,9 +242,10 @@ class LensesFacts:
     no_sigma: str  # why σ is not known; empty if known
 
 
-def lenses_facts(evaluated: EvaluatedSurvey) -> LensesFacts:
-    sparse, residual = evaluated.solved.sparse, evaluated.residual_px
-    covariance = evaluated.posterior.of_lens()
+def lenses_facts(survey: Survey, posterior: Posterior, network: Network) -> LensesFacts:
+    """Return what the section on lenses shows: parameters with σ and correlations, and residuals over the image."""
+    sparse, residual = posterior.sparse, reprojection_residuals(network)
+    covariance = posterior.of_lens()
     longest = sparse.lenses.longest
     camera_of = sparse.image_camera_id[sparse.obs_image]
     lenses = []
@@ -243,7 +254,7 @@ def lenses_facts(evaluated: EvaluatedSurvey) -> LensesFacts:
         rows = np.flatnonzero(camera_of == key)
         lenses.append(
             _lens(
-                evaluated.solved.survey,
+                survey,
                 key,
                 camera,
                 photographs=int((sparse.image_camera_id == key).sum()),
@@ -255,7 +266,7 @@ def lenses_facts(evaluated: EvaluatedSurvey) -> LensesFacts:
         )
     return LensesFacts(
         rmse_px=_rmse(residual),
-        sigma_px=evaluated.solved.model.sigma_px,
+        sigma_px=posterior.solution.sigma_px,
         observations=len(residual),
         points=len(sparse.point_id),
         photographs=len(sparse.image_name),

@@ -36,13 +36,14 @@ def chromium_path() -> str:
     if os.environ.get("CHROMIUM") and browser and shutil.which(browser) is None:
         raise BackendUnavailableError(
             "chromium-variable",
-            f"The environment variable CHROMIUM names {browser}, which is no program. Correct it, or unset it.",
+            f"The environment variable CHROMIUM names {browser}, which is no program.",
+            remedy="Correct it, or unset it.",
         )
     if browser is None:
         raise BackendUnavailableError(
             "chromium-missing",
-            "--pdf needs Chromium or Chrome, and neither is installed. Install one (`apt-get install chromium`), "
-            "or name its path in the environment variable CHROMIUM.",
+            "--pdf needs Chromium or Chrome, and neither is installed.",
+            remedy="Install one (`apt-get install chromium`), or name its path in the variable CHROMIUM.",
         )
     return browser
 

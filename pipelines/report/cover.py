@@ -8,11 +8,14 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from pipelines.adjust.posterior import Posterior
 from pipelines.core.errors import GeorefError
 from pipelines.core.figures import MISSING, Headline, SurfaceErrors, length_text
 from pipelines.core.sentences import listed
 from pipelines.core.stages import BY_NAME, HILLSHADE, ORTHOPHOTO_PREVIEW
+from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
+from pipelines.geometry.footprints import PointSurface
 from pipelines.report.cameras import LensesFacts
 from pipelines.report.delivered import measured_share
 from pipelines.report.options import ReportOptions
@@ -29,8 +32,10 @@ from pipelines.report.page import (
 )
 from pipelines.report.place import OverlapFacts
 from pipelines.report.plots.maps import RasterPlace, raster_map
-from pipelines.report.views import EvaluatedSurvey
 from pipelines.survey.area import ground_sampling_m
+from pipelines.survey.report import EvaluationReport
+from pipelines.survey.survey import Survey
+from pipelines.survey.target_crs import TargetCrs
 
 _NOTES = {
     "measured": "RMSE of the triangulated check points, their survey's error included",
@@ -60,20 +65,28 @@ class CoverFacts:
 
 
 def cover_facts(
-    evaluated: EvaluatedSurvey, overlap: OverlapFacts, lenses: LensesFacts, options: ReportOptions
+    workspace: Workspace,
+    survey: Survey,
+    posterior: Posterior,
+    report: EvaluationReport,
+    options: ReportOptions,
+    *,
+    crs: TargetCrs,
+    scene: FloatArray,
+    overlap: OverlapFacts,
+    lenses: LensesFacts,
 ) -> CoverFacts:
-    """Return the cover; an InputError: the logo is no PNG or JPEG, or too large."""
-    survey, crs, report = evaluated.solved.survey, evaluated.crs, evaluated.report
+    """Return the cover, of a scene (N, 3) in `geo`; an InputError: the logo is no PNG or JPEG, or too large."""
     area = MISSING if report.area_ha is None else f"{number_text(report.area_ha, 2)} ha"
-    delivered = measured_share(evaluated.workspace)
+    delivered = measured_share(workspace)
     if delivered is not None:  # what the list of delivered files says of the rasters
         area = f"{number_text(delivered[1], 2)} ha, {share(delivered[0])} of it measured"
     elif report.area_measured is not None:
         area += f", {report.area_measured:.0%} of it measured"
-    surface = report.headline.surface
-    height_m, gsd_m = flying_height_m(evaluated), ground_sampling_m(evaluated.solved)
+    surface, solution = report.headline.surface, posterior.solution
+    height_m, gsd_m = flying_height_m(solution.center_in_geo, scene), ground_sampling_m(solution, posterior.sparse)
     previews = {"Orthophoto": ORTHOPHOTO_PREVIEW, "Surface model": HILLSHADE}
-    shown = {name: _raster_picture(evaluated.workspace, name, product) for name, product in previews.items()}
+    shown = {name: _raster_picture(workspace, name, product) for name, product in previews.items()}
     registered = f"{count_text(lenses.photographs)} of {count_text(len(survey.images))} registered"
     control, check = (count_text(len(points)) for points in (survey.control_points, survey.check_points))
     cameras = [
@@ -99,12 +112,12 @@ def cover_facts(
             ("Coordinate system", crs.crs.name),
             ("Heights", crs.crs.vertical.name if crs.origin is None else crs.crs.vertical.described),
         ),
-        headline=evaluated.report.headline,
+        headline=report.headline,
         surface=() if surface is None else surface.parts,
         unseen=0 if surface is None else surface.unseen,
-        trained=evaluated.report.test_views is not None,
-        accuracy_note=_NOTES[evaluated.report.headline.kind],
-        without=listed(evaluated.report.headline.blunders),
+        trained=report.test_views is not None,
+        accuracy_note=_NOTES[report.headline.kind],
+        without=listed(report.headline.blunders),
     )
 
 
@@ -135,10 +148,9 @@ def _raster_picture(workspace: Workspace, name: str, product: str) -> Picture | 
     return picture_of_png(raster_map(limited(read_pixels(path), _PREVIEW_PX), place, name, heights))
 
 
-def flying_height_m(evaluated: EvaluatedSurvey) -> float | None:
-    """Return the median height of the photographs above the surface below them; None: there is no surface."""
-    center, surface = evaluated.center_in_geo, evaluated.surface
-    return None if surface is None else float(np.median(center[:, 2] - surface.heights(center[:, :2])))
+def flying_height_m(center: FloatArray, scene: FloatArray) -> float | None:
+    """Return the median height of photographs (n, 3) above the surface of a scene (N, 3); None: it is empty."""
+    return float(np.median(center[:, 2] - PointSurface(scene).heights(center[:, :2]))) if len(scene) else None
 
 
 def days_of(times_s: Iterable[float | None]) -> str:

@@ -20,7 +20,7 @@ from pipelines.formats.georef_sidecar import (
     MeshSidecar,
     sidecar_path,
 )
-from pipelines.formats.geotiff import frame_of
+from pipelines.formats.geotiff import raster_frame
 from pipelines.report.page import number_text, share
 
 _STAGES = ("export-ply", *(spec.name for spec in DELIVERABLES if spec.name != "report"))
@@ -131,7 +131,7 @@ def _sigma(horizontal_m: float, vertical_m: float) -> str:
 
 def _cell(file: Path, values: dict[str, Any]) -> str:
     try:
-        step = frame_of(file).step_x
+        step = raster_frame(file).step_x
     except GeorefError:
         return ""
     unit = next(iter(values.get("units") or ("metre",)))

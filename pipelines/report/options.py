@@ -7,7 +7,19 @@ from pipelines.survey.options import CrsOptions
 
 
 class ReportOptions(CrsOptions):
-    """Options of the report of a survey."""
+    """Options of the report of a survey.
+
+    A cover with names, logo, pictures and the facts of the survey; verdicts with their rules; accuracy, control and
+    check points with cuts of the photographs, positions, overlap, lenses and test views; in an appendix, the
+    processing. Options, hashes and warnings are folded, and not in the PDF. The page is one file and needs no
+    network. It shows what was made: make rasters first, whose previews are on the cover.
+
+    Examples:
+      georef report flight
+      georef report flight --pdf --crs EPSG:32632+3855
+      georef report flight --pdf --title "Gravel pit" --client "City of X" --author "Y Survey" --logo logo.png
+      georef report flight --to handover/report.html
+    """
 
     crs: str | None = Field(
         None,

@@ -26,7 +26,7 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.figures import ACCURACY_H, MISSING
 from pipelines.core.files import file_size
-from pipelines.core.sentences import duration, printable_lines, without_commands
+from pipelines.core.sentences import duration, printable_lines, without_folders
 from pipelines.core.types import ByteArray
 from pipelines.formats.image_file import MAX_PIXELS, header_size, read_bytes
 
@@ -49,6 +49,7 @@ def metres(value: float | None) -> str:
 
 
 def in_metres(value: float | None) -> str:
+    """Return a length with its unit; a dash for None and NaN."""
     return MISSING if value is None or isnan(value) else f"{metres(value)} m"
 
 
@@ -67,6 +68,7 @@ def share(value: float | None) -> str:
 
 
 def decibel(value: float | None) -> str:
+    """Return a PSNR with two decimals and its unit; a dash for None."""
     return MISSING if value is None else f"{number_text(value, 2)} dB"
 
 
@@ -93,6 +95,7 @@ def volume(value: float | None) -> str:
 
 
 def signed_volume(value: float | None) -> str:
+    """Return a volume as `volume` does, with its sign."""
     return _with_sign(volume(value))
 
 
@@ -104,7 +107,7 @@ def moment(value: datetime | None) -> str:
 # Filters of the templates, and the forms in which they ask for a figure of the document.
 FORMS: dict[str, Callable[..., str]] = {
     "accuracy": ACCURACY_H.with_unit,
-    "client": without_commands,
+    "client": without_folders,
     "file_size": lambda size: f"{size / 1e6:.1f} MB" if size >= 95_000 else f"{size / 1e3:.1f} kB",
     "as_json": partial(json.dumps, allow_nan=False),  # in full, for programs that read the page
     "whole": count_text,
@@ -229,7 +232,9 @@ def png_file(path: Path) -> Picture | None:
         return None
     data = read_bytes(path)
     if header_size(data) is None or not data.startswith(_PNG):
-        raise InputError("not-a-png", "is no PNG. Make it again with `georef evaluate --force`.", path=path)
+        raise InputError(
+            "not-a-png", "is no PNG.", path=path, remedy="Make it again with `georef evaluate --force`."
+        )
     return picture_of_png(data)
 
 
@@ -252,7 +257,7 @@ def logo_picture(path: Path) -> Picture:
     data = read_bytes(path)
     if not data.startswith((_PNG, _JPEG)):
         raise InputError(
-            "logo-not-a-picture", "is neither PNG nor JPEG. Give another file.", path=path, field="--logo"
+            "logo-not-a-picture", "is neither PNG nor JPEG.", path=path, field="--logo", remedy="Give another file."
         )
     width, height = header_size(data) or (0, 0)
     if width * height > _MOST_LOGO_PIXELS:
@@ -277,8 +282,9 @@ def read_pixels(path: Path) -> ByteArray:
     if 0 < width * height <= MAX_PIXELS:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None or pixels.dtype != np.uint8:
-        message = "is no picture that can be shown. Delete it, or make it again."
-        raise InputError("not-a-picture", message, path=path)
+        message = "is no picture that can be shown."
+        remedy = "Delete it, or make it again."
+        raise InputError("not-a-picture", message, path=path, remedy=remedy)
     to_rgba = {2: cv2.COLOR_GRAY2RGBA, 3: cv2.COLOR_BGR2RGBA, 4: cv2.COLOR_BGRA2RGBA}
     return np.asarray(cv2.cvtColor(pixels, to_rgba[2 if pixels.ndim == 2 else pixels.shape[2]]))
 

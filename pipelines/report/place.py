@@ -6,14 +6,15 @@ import numpy as np
 from scipy.sparse import csr_matrix, triu
 from scipy.sparse.csgraph import connected_components
 
+from pipelines.adjust.posterior import Posterior
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geodesy.operations import Operation
 from pipelines.geometry.network import Network
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.plots.plans import MapCoordinates, NamedPlaces, match_plan, overlap_plan, site_plan
-from pipelines.report.views import EvaluatedSurvey
 from pipelines.survey.area import overlap_of
+from pipelines.survey.solution import Solution
 from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.target_crs import TargetCrs
 
@@ -37,6 +38,7 @@ def map_coordinates(crs: TargetCrs) -> MapCoordinates:
 
 
 def heads_of(crs: TargetCrs) -> Texts:
+    """Return the heads of the three coordinates' columns: axis and unit."""
     axes = zip(axis_names(crs), crs.crs.short_units, strict=True)
     first, second, third = (f"{axis} in {unit}" for axis, unit in axes)
     return first, second, third
@@ -89,9 +91,10 @@ class PlaceFacts:
     ground_size_m: tuple[float, float]
 
 
-def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
-    survey, crs = evaluated.solved.survey, evaluated.crs
-    everything = np.concatenate([evaluated.scene_in_geo, evaluated.center_in_geo])
+def place_facts(survey: Survey, solution: Solution, scene: FloatArray, crs: TargetCrs) -> PlaceFacts:
+    """Return what the section on the place shows, of a scene (N, 3) in `geo`: extents, size in metres, plan."""
+    center = solution.center_in_geo
+    everything = np.concatenate([scene, center])
     geographic: tuple[AxisExtent, ...] = ()
     if survey.origin is not None:
         lla = lla_from_enu(everything, survey.origin)
@@ -99,11 +102,10 @@ def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
         names = ("longitude", "latitude", "ellipsoidal height")
         geographic = _axes(names, ("°", "°", "m"), lla[:, [1, 0, 2]])
     xyz = crs.xyz_from_geo(everything)
-    scene, center = evaluated.scene_in_geo, evaluated.center_in_geo[:, :2]
     size = np.ptp(scene, axis=0).tolist() if len(scene) else [0.0, 0.0, 0.0]
     plan = site_plan(
-        center[evaluated.solved.indices("train")],
-        center[evaluated.solved.indices("test")],
+        center[solution.indices("train"), :2],
+        center[solution.indices("test"), :2],
         named_places(survey.control_points),
         named_places(survey.check_points),
         scene[:: max(1, len(scene) // _MOST_DOTS), :2],
@@ -121,6 +123,7 @@ def place_facts(evaluated: EvaluatedSurvey) -> PlaceFacts:
 
 
 def named_places(points: tuple[SurveyedPoint, ...]) -> NamedPlaces:
+    """Return the plan positions (N, 2) of surveyed points in `geo`, in metres, with their names."""
     place = np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]
     return NamedPlaces(place, [point.name for point in points])
 
@@ -157,14 +160,18 @@ class OverlapFacts:
     parts: int  # groups of photographs without a common point; 1: all are connected
 
 
-def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:
-    center = evaluated.center_in_geo[:, :2]
-    raster = overlap_of(evaluated.solved, evaluated.scene_in_geo)
+def overlap_facts(posterior: Posterior, network: Network, scene: FloatArray, crs: TargetCrs) -> OverlapFacts:
+    """Return what the section on overlap shows: photographs by cell, pairs of photographs by shared points.
+
+    The network has the image observations; the scene (N, 3) is in `geo`.
+    """
+    solution, sparse = posterior.solution, posterior.sparse
+    center, raster = solution.center_in_geo[:, :2], overlap_of(solution, sparse, scene)
     inside = np.zeros(0) if raster is None else raster.count[raster.count >= 0]
-    pairs, shared = links_of(evaluated.network)
+    pairs, shared = links_of(network)
     strongest = np.argsort(-shared, kind="stable")[:_MOST_LINKS]
     tied, parts = ties_of(len(center), pairs, shared)
-    least, coordinates = int(tied.argmin()), map_coordinates(evaluated.crs)
+    least, coordinates = int(tied.argmin()), map_coordinates(crs)
     return OverlapFacts(
         overlap=None
         if raster is None
@@ -178,7 +185,7 @@ def overlap_facts(evaluated: EvaluatedSurvey) -> OverlapFacts:
         drawn_links=len(strongest),
         tied_points=TIED_POINTS,
         median_tied=float(np.median(tied)),
-        least_tied=evaluated.solved.sparse.image_name[least],
+        least_tied=sparse.image_name[least],
         least_tied_count=int(tied[least]),
         parts=parts,
     )

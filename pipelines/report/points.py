@@ -7,19 +7,21 @@ from typing import Literal
 
 import numpy as np
 
+from pipelines.adjust.posterior import Posterior
 from pipelines.core.errors import InputError
 from pipelines.core.plan import photograph_folder
 from pipelines.core.progress import Progress
 from pipelines.core.types import ByteArray, FloatArray
+from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import project
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.report.page import Picture, limited, picture_of
 from pipelines.report.place import Texts, heads_of, texts_of
-from pipelines.report.views import EvaluatedSurvey
 from pipelines.survey.marks import MarkRays, mark_rays
 from pipelines.survey.photographs import decoded_photograph
-from pipelines.survey.report import PointResidual, PredictedPointError
-from pipelines.survey.survey import SurveyedPoint
+from pipelines.survey.report import CheckPointErrors, EvaluationReport, PointResidual, PredictedPointError
+from pipelines.survey.survey import Survey, SurveyedPoint
+from pipelines.survey.target_crs import TargetCrs
 
 _SIDE_SHARE = 1 / 30  # of the longer side of the photographs
 _LEAST_SIDE_PX = 96
@@ -62,14 +64,17 @@ class Chip:
 
 
 def cut_chips(
-    evaluated: EvaluatedSurvey, wanted: Sequence[tuple[_Group, int]], progress: Progress
+    workspace: Workspace,
+    survey: Survey,
+    sparse: SparseModel,
+    wanted: Sequence[tuple[_Group, int]],
+    progress: Progress,
 ) -> tuple[dict[tuple[str, str], tuple[Chip, ...]], int]:
     """Return chips of marks by kind and name of points, and their side in pixels.
 
     Photographs are decoded one at a time, each once; an InputError: a photograph is not as surveyed.
     """
-    sparse, survey = evaluated.solved.sparse, evaluated.solved.survey
-    folder = photograph_folder(evaluated.workspace, survey.image_dir)
+    folder = photograph_folder(workspace, survey.image_dir)
     sha256 = {image.name: image.sha256 for image in survey.images}
     side = _side_px(sparse)
     by_image: dict[int, list[tuple[_Group, int]]] = defaultdict(list)
@@ -81,8 +86,9 @@ def cut_chips(
             name = sparse.image_name[image]
             pixels = decoded_photograph(folder / name, sha256.get(name, ""))
             if pixels is None:
-                message = "cannot be decoded, or has changed. Restore the photograph."
-                raise InputError("photograph-damaged", message, path=folder / name)
+                message = "cannot be decoded, or has changed."
+                remedy = "Restore the photograph."
+                raise InputError("photograph-damaged", message, path=folder / name, remedy=remedy)
             for group, mark in of_image:
                 places = np.stack([group.rays.xy_px[mark], group.adjusted_px[mark], group.surveyed_px[mark]])
                 owner = group.kind, group.points[group.rays.point[mark]].name
@@ -162,25 +168,33 @@ class PointsFacts:
 
 
 def points_facts(
-    evaluated: EvaluatedSurvey, chips_a_point: int, progress: Progress
+    workspace: Workspace,
+    survey: Survey,
+    posterior: Posterior,
+    report: EvaluationReport,
+    crs: TargetCrs,
+    *,
+    chips_a_point: int,
+    progress: Progress,
 ) -> tuple[PointsFacts, PointsFacts]:
     """Return the control and check points of an evaluated survey, with 240 chips at most."""
-    survey, report = evaluated.solved.survey, evaluated.report
+    sparse, surface = posterior.sparse, report.checkpoints.surface
     checked = report.checkpoints.triangulated.points
     groups = (
-        _group(evaluated, "control", survey.control_points, report.fit.gcp.points, "fit.gcp.points"),
-        _group(evaluated, "check", survey.check_points, checked, "checkpoints.triangulated.points"),
+        _group(posterior, "control", survey.control_points, report.fit.gcp.points, "fit.gcp.points"),
+        _group(posterior, "check", survey.check_points, checked, "checkpoints.triangulated.points"),
     )
     total = sum(len(group.points) for group in groups)
     each = min(chips_a_point, max(1, _MOST_CHIPS // total)) if total else 0
-    wanted = [chip for group in groups for chip in _wanted(group, each, evaluated.solved.sparse)]
-    chips, side_px = cut_chips(evaluated, wanted[:_MOST_CHIPS], progress)
-    control, check = (_facts(evaluated, group, chips, side_px) for group in groups)
-    return control, check
+    wanted = [chip for group in groups for chip in _wanted(group, each, sparse)]
+    chips, side_px = cut_chips(workspace, survey, sparse, wanted[:_MOST_CHIPS], progress)
+    rejected = posterior.solution.control_outliers
+    control = _facts(groups[0], crs, chips, side_px, surface=surface, rejected=rejected)
+    return control, _facts(groups[1], crs, chips, side_px, surface=surface)
 
 
 def _group(
-    evaluated: EvaluatedSurvey,
+    posterior: Posterior,
     kind: Kind,
     points: tuple[SurveyedPoint, ...],
     errors: Sequence[PointResidual],
@@ -189,9 +203,9 @@ def _group(
     by_name = {row.name: row.error_m for row in errors}
     surveyed = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
     error = np.array([by_name.get(point.name) or (np.nan,) * 3 for point in points]).reshape(-1, 3)
-    rays = mark_rays(points, evaluated.solved.sparse, wrong=True)
+    rays = mark_rays(points, posterior.sparse, wrong=True)
     surveyed_px, adjusted_px = (
-        _projected(evaluated, place[rays.point], rays.camera) for place in (surveyed, surveyed + error)
+        _projected(posterior, place[rays.point], rays.camera) for place in (surveyed, surveyed + error)
     )
     return _Group(kind, points, errors, field, surveyed, rays, surveyed_px, adjusted_px)
 
@@ -211,14 +225,19 @@ def _wanted(group: _Group, each: int, sparse: SparseModel) -> list[tuple[_Group,
 
 
 def _facts(
-    evaluated: EvaluatedSurvey, group: _Group, chips: dict[tuple[str, str], tuple[Chip, ...]], side_px: int
+    group: _Group,
+    crs: TargetCrs,
+    chips: dict[tuple[str, str], tuple[Chip, ...]],
+    side_px: int,
+    *,
+    surface: CheckPointErrors | None,
+    rejected: tuple[str, ...] = (),
 ) -> PointsFacts:
     distance = group.rays.xy_px - group.adjusted_px
     place = {row.name: index for index, row in enumerate(group.errors)}
-    surface = evaluated.report.checkpoints.surface
     on_surface = {} if surface is None else {row.name: index for index, row in enumerate(surface.points)}
     rows = []
-    texts = texts_of(evaluated.crs, group.surveyed_in_geo)
+    texts = texts_of(crs, group.surveyed_in_geo)
     for index, (point, coordinates) in enumerate(zip(group.points, texts, strict=True)):
         at = place.get(point.name)
         row = None if at is None else group.errors[at]
@@ -230,7 +249,7 @@ def _facts(
                 coordinates=coordinates,
                 field=None if at is None else f"{group.field}.{at}",
                 blunder=bool(getattr(row, "blunder", False)),
-                rejected=group.kind == "control" and point.name in evaluated.solved.model.control_outliers,
+                rejected=point.name in rejected,
                 predicted=isinstance(row, PredictedPointError),
                 surface_field=None if surface_at is None else f"checkpoints.surface.points.{surface_at}",
                 rmse_px=float(np.sqrt(squares.mean())) if len(squares) and np.isfinite(squares).all() else None,
@@ -239,7 +258,7 @@ def _facts(
         )
     return PointsFacts(
         kind=group.kind,
-        heads=heads_of(evaluated.crs),
+        heads=heads_of(crs),
         rows=tuple(rows),
         chips=sum(len(row.chips) for row in rows),
         marks=len(group.rays.point),
@@ -249,13 +268,12 @@ def _facts(
     )
 
 
-def _projected(evaluated: EvaluatedSurvey, point_in_geo: FloatArray, camera: np.ndarray) -> FloatArray:
+def _projected(posterior: Posterior, point_in_geo: FloatArray, camera: np.ndarray) -> FloatArray:
     """Return the pixels (K, 2) of points (K, 3) in an adjusted camera each; NaN for points that are NaN."""
-    solved = evaluated.solved
-    in_model = solved.geo_from_model.inverse().apply(point_in_geo)
+    poses, in_model = posterior.solution.poses, posterior.solution.similarity.inverse().apply(point_in_geo)
     pixels = np.full((len(camera), 2), np.nan)
     for row, index in enumerate(camera):
-        in_cam = solved.poses.cam_from_model[index] @ (in_model[row] - solved.poses.cam_center_in_model[index])
+        in_cam = poses.cam_from_model[index] @ (in_model[row] - poses.cam_center_in_model[index])
         if in_cam[2] > 0:
-            pixels[row] = project(solved.sparse.camera_of(int(index)), in_cam)
+            pixels[row] = project(posterior.sparse.camera_of(int(index)), in_cam)
     return pixels

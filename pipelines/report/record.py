@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.core.errors import InputError
+from pipelines.core.figures import DEPTH_ERRORS
 from pipelines.core.options import flag_name, notation
 from pipelines.core.products import Remark, load_json
 from pipelines.core.stages import (
@@ -27,7 +28,6 @@ from pipelines.core.stages import (
 from pipelines.core.staleness import cautions_by_stage, status
 from pipelines.core.workspace import Workspace
 from pipelines.report.page import Picture, png_file, preview
-from pipelines.report.views import EvaluatedSurvey
 from pipelines.survey.change_report import Change, ChangedRegion
 from pipelines.survey.report_parts import LidarReport
 from pipelines.survey.survey import Survey
@@ -68,6 +68,7 @@ class RecordFacts:
 
 
 def record_facts(workspace: Workspace, survey: Survey) -> RecordFacts:
+    """Return what the appendix shows of all stages but `report`: state, options, inputs, warnings and versions."""
     stages: list[StageRecord] = []
     versions: dict[str, dict[str, list[str]]] = {}
     for row in status(workspace):
@@ -137,12 +138,19 @@ _LISTED = 12
 
 @dataclass(frozen=True)
 class LidarFacts:
-    """LiDAR of a training: axis, shift and σ in metres; number of areas in the table; their map if it was kept."""
+    """LiDAR of a training: axis, shift and σ in metres; number of areas in the table; their map if it was kept.
+
+    `errors`: field, head and form of each column of the errors at points that were held out.
+    """
 
     report: LidarReport
     shift: tuple[tuple[str, float, float], ...]
     listed: int
     map: Picture | None
+    errors: tuple[tuple[str, str, str], ...] = tuple(
+        (name, figure.label, "whole" if not figure.unit else "signed" if name == "bias_m" else "metres")
+        for name, figure in DEPTH_ERRORS.items()
+    )
 
 
 def lidar_facts(workspace: Workspace) -> LidarFacts | None:
@@ -183,9 +191,7 @@ def change_facts(workspace: Workspace, record: RecordFacts) -> ChangeFacts | Non
     return ChangeFacts(change, earlier, change.regions[:_LISTED])
 
 
-def reference_facts(evaluated: EvaluatedSurvey) -> dict[str, Picture | None]:
+def reference_facts(workspace: Workspace) -> dict[str, Picture | None]:
     """Return the pictures of a comparison; None: nothing was measured."""
-    if evaluated.report.reference is None:
-        return {}
     products = {"map": REFERENCE_MAP, "histogram": REFERENCE_HISTOGRAM}
-    return {name: png_file(evaluated.workspace.root / product) for name, product in products.items()}
+    return {name: png_file(workspace.root / product) for name, product in products.items()}

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from pipelines import __version__
+from pipelines.adjust.posterior import Posterior
+from pipelines.adjust.solution import posterior_of
 from pipelines.core.files import replace_text
 from pipelines.core.products import Remark, union
 from pipelines.core.stages import REPORT_PAGE
-from pipelines.core.workspace import StageRun, Summary
+from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.report.accuracy import accuracy_facts
 from pipelines.report.cameras import CamerasFacts, LensesFacts, cameras_facts, lenses_facts
 from pipelines.report.chromium import chromium_path, print_pdf
@@ -26,8 +28,12 @@ from pipelines.report.place import OverlapFacts, overlap_facts, place_facts
 from pipelines.report.points import points_facts
 from pipelines.report.record import RecordFacts, change_facts, lidar_facts, record_facts, reference_facts
 from pipelines.report.verdicts import Measured, Verdict, verdicts
-from pipelines.report.views import EvaluatedSurvey, load_evaluated, training_facts, views_facts
-from pipelines.survey.trained_model import TrainedModel
+from pipelines.report.views import adjusted_network, read_evaluated, seen_scene, training_facts, views_facts
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.report import EvaluationReport
+from pipelines.survey.solution import Solution, TrainedModel, read_sfm
+from pipelines.survey.survey import Survey
+from pipelines.survey.target_crs import TargetCrs, usable_crs
 
 _ROOM = __name__.rpartition(".")[0]
 _STEPS = 9
@@ -38,9 +44,12 @@ def run(stage: StageRun, options: ReportOptions) -> Summary:
     if options.pdf:
         chromium_path()  # a missing browser is told before the work begins
     with stage.progress.task("covariances of cameras and lenses", 1) as task:
-        evaluated = load_evaluated(stage.workspace, options)
+        solution, report = read_evaluated(stage.workspace)
+        sfm, survey = read_sfm(stage.workspace, solution), solution.weighted(load_survey(stage.workspace))
+        posterior = posterior_of(stage.workspace, solution, sfm)
         task.advance()
-    page, summary = report_page(evaluated, options, stage)
+    crs = usable_crs(options, survey.origin, solution.center_in_geo, survey.vertical)
+    page, summary = report_page(stage, survey, report, posterior, crs=crs, options=options)
     html = stage.out / REPORT_PAGE.rpartition("/")[2]
     replace_text(html, render_page(page, _ROOM))
     if options.pdf:
@@ -52,7 +61,7 @@ def run(stage: StageRun, options: ReportOptions) -> Summary:
     size_mb = html.stat().st_size / 1e6
     return Summary(
         f"{', '.join(f'{count} {level}' for level, count in counts.items() if count)}; {size_mb:.1f} MB",
-        {**counts, "bytes": html.stat().st_size, "pdf": options.pdf, "crs": evaluated.crs.crs.name},
+        {**counts, "bytes": html.stat().st_size, "pdf": options.pdf, "crs": crs.crs.name},
         cautions=summary.cautions,
     )
 
@@ -64,22 +73,35 @@ _ACCURACY = {
 }
 
 
-def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: StageRun) -> tuple[Page, SummaryFacts]:
-    workspace, survey = stage.workspace, evaluated.solved.survey
+def report_page(
+    stage: StageRun,
+    survey: Survey,
+    report: EvaluationReport,
+    posterior: Posterior,
+    *,
+    crs: TargetCrs,
+    options: ReportOptions,
+) -> tuple[Page, SummaryFacts]:
+    """Return the report of a survey, and what its cover and verdicts say."""
+    workspace, solution = stage.workspace, posterior.solution
+    network = adjusted_network(solution, posterior.sparse)
+    scene = seen_scene(network, solution.similarity)
     with stage.progress.task("sections", _STEPS) as task:
-        place = place_facts(evaluated)
+        place = place_facts(survey, solution, scene, crs)
         task.advance(note="place")
-        cameras = cameras_facts(evaluated)
+        cameras = cameras_facts(survey, posterior, crs)
         task.advance(note="positions")
-        overlap = overlap_facts(evaluated)
+        overlap = overlap_facts(posterior, network, scene, crs)
         task.advance(note="overlap")
-        lenses = lenses_facts(evaluated)
+        lenses = lenses_facts(survey, posterior, network)
         task.advance(note="lenses")
-        control, check = points_facts(evaluated, options.chips, stage.progress)
+        control, check = points_facts(
+            workspace, survey, posterior, report, crs, chips_a_point=options.chips, progress=stage.progress
+        )
         task.advance(note="points")
-        accuracy = accuracy_facts(evaluated)
+        accuracy = accuracy_facts(workspace, report, survey.check_points)
         task.advance(note="accuracy")
-        of_gaussians, training = _sections_of_gaussians(evaluated, options)
+        of_gaussians, training = _sections_of_gaussians(workspace, solution, report, options)
         task.advance(note="views")
         record = record_facts(workspace, survey)
         change = change_facts(workspace, record)
@@ -87,14 +109,19 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
         task.advance(note="delivered files")
         task.advance(note="record")
     what = "3D Gaussian splat" if of_gaussians else "cameras"
-    summary = summary_facts(evaluated, cameras, overlap, lenses, record)
+    summary = summary_facts(
+        survey, solution, report, cameras=cameras, overlap=overlap, lenses=lenses, record=record,
+        delivered=measured_share(workspace),
+    )  # fmt: skip
     page = Page(
         title=options.title or f"Survey report: {workspace.root.name}",
         subtitle=f"{what} in a local metric frame, not on Earth, with predicted accuracy"
         if survey.origin is None
-        else f"Georeferenced {what}, {_ACCURACY[evaluated.report.headline.kind]}",
+        else f"Georeferenced {what}, {_ACCURACY[report.headline.kind]}",
         about={"Made": moment(datetime.now(UTC)), "Program": f"GeoRefGS {__version__}"},
-        cover=cover_facts(evaluated, overlap, lenses, options),
+        cover=cover_facts(
+            workspace, survey, posterior, report, options, crs=crs, scene=scene, overlap=overlap, lenses=lenses
+        ),
         sections=(
             Section("summary", "Summary", "summary.html", summary),
             Section("delivered", "What was delivered", "delivered.html", delivered),
@@ -112,25 +139,26 @@ def report_page(evaluated: EvaluatedSurvey, options: ReportOptions, stage: Stage
             Section("glossary", "Glossary", "glossary.html", bool(of_gaussians)),
             *training,  # last: paper leaves it out, and shall not lack a number
         ),
-        document=evaluated.report.model_dump(mode="json"),
+        document=report.model_dump(mode="json"),
     )
     return page, summary
 
 
 def _sections_of_gaussians(
-    evaluated: EvaluatedSurvey, options: ReportOptions
+    workspace: Workspace, model: Solution, report: EvaluationReport, options: ReportOptions
 ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:
     """Return the sections on what the Gaussians show, and those of the appendix on their training.
 
     There are none before training, or if `evaluate` has not seen the Gaussians; none on what was not compared.
     """
-    workspace, model, test = evaluated.workspace, evaluated.solved.model, evaluated.report.test_views
+    test = report.test_views
     if test is None or not isinstance(model, TrainedModel):
         return (), ()
     views, training = views_facts(workspace, test, options.views), training_facts(workspace, model)
-    reference, lidar = reference_facts(evaluated), lidar_facts(workspace)
+    lidar = lidar_facts(workspace)
     shown = [Section("test-views", "Test views", "views.html", views)]
-    if evaluated.report.reference is not None:
+    if report.reference is not None:
+        reference = reference_facts(workspace)
         shown.append(Section("reference", "Surface against a reference", "reference.html", reference))
     if lidar is not None:
         shown.append(Section("lidar", "LiDAR in the training", "lidar.html", lidar))
@@ -147,15 +175,18 @@ class SummaryFacts:
 
 
 def summary_facts(
-    evaluated: EvaluatedSurvey,
+    survey: Survey,
+    solution: Solution,
+    report: EvaluationReport,
+    *,
     cameras: CamerasFacts,
     overlap: OverlapFacts,
     lenses: LensesFacts,
     record: RecordFacts,
+    delivered: tuple[float, float] | None,
 ) -> SummaryFacts:
     """Return the summary of an evaluated survey, of which it needs the facts of four sections."""
-    survey, report = evaluated.solved.survey, evaluated.report
-    cautions = union(evaluated.solved.model.cautions, report.cautions)
+    cautions = union(solution.cautions, report.cautions)
     measured = Measured(
         photographs=len(survey.images),
         registered=lenses.photographs,
@@ -170,9 +201,9 @@ def summary_facts(
         check_points=len(survey.check_points),
         stale=tuple(stage.name for stage in record.stages if stage.state in ("stale", "damaged")),
         outliers=tuple(outlier.name for outlier in cameras.outliers),
-        rejected=tuple(evaluated.solved.model.control_outliers),
+        rejected=tuple(solution.control_outliers),
         largest_fix=cameras.largest_fix,
-        delivered=measured_share(evaluated.workspace),
+        delivered=delivered,
     )
     return SummaryFacts(
         verdicts=verdicts(report, measured, cautions),

@@ -116,7 +116,7 @@ def verdicts(report: EvaluationReport, measured: Measured, cautions: Sequence[Re
     return tuple(Verdict(subject, *fields) for subject, fields in by_subject.items())
 
 
-def level_of(value: float, limits: tuple[float, float], *, more_is_better: bool) -> Level:
+def verdict_of(value: float, limits: tuple[float, float], *, more_is_better: bool) -> Level:
     """Return the verdict on a value by the limits of good and fair."""
     good, fair = limits
     if more_is_better:
@@ -126,7 +126,7 @@ def level_of(value: float, limits: tuple[float, float], *, more_is_better: bool)
 
 def _registered(measured: Measured) -> _Fields:
     part = measured.registered / measured.photographs if measured.photographs else 0.0
-    level = level_of(part, REGISTERED, more_is_better=True)
+    level = verdict_of(part, REGISTERED, more_is_better=True)
     lost = measured.photographs - measured.registered
     reason = "all photographs contribute" if not lost else f"{lost} not used: blurred, or without overlap"
     rule = f"good from {share(REGISTERED[0])}, fair from {share(REGISTERED[1])}"
@@ -140,7 +140,7 @@ def _overlap(measured: Measured) -> _Fields:
     )
     if measured.enough_share is None:
         return "unknown", "no scene", "too few SfM points to map the ground", rule
-    level = level_of(measured.enough_share, OVERLAP, more_is_better=True)
+    level = verdict_of(measured.enough_share, OVERLAP, more_is_better=True)
     reason = "enough rays everywhere" if level == "good" else "the rim of the scene is less accurate: fly beyond it"
     if measured.parts > 1:
         level = "fair" if level == "good" else level
@@ -151,7 +151,7 @@ def _overlap(measured: Measured) -> _Fields:
 
 def _delivered(part: float, area_ha: float) -> _Fields:
     rule = f"good from {share(DELIVERED[0])} of the delivered area, fair from {share(DELIVERED[1])}"
-    level = level_of(part, DELIVERED, more_is_better=True)
+    level = verdict_of(part, DELIVERED, more_is_better=True)
     reason = (
         "the photographs show almost all that is delivered"
         if level == "good"
@@ -164,7 +164,7 @@ def _reprojection(measured: Measured) -> _Fields:
     rule = f"good up to {REPROJECTION_PX[0]:g} px, fair up to {REPROJECTION_PX[1]:g} px"
     if measured.rmse_px is None:
         return "unknown", "no observations", "the SfM model has none", rule
-    level = level_of(measured.rmse_px, REPROJECTION_PX, more_is_better=False)
+    level = verdict_of(measured.rmse_px, REPROJECTION_PX, more_is_better=False)
     reason = (
         "cameras, lens and points fit together"
         if level == "good"
@@ -179,7 +179,7 @@ def _fixes(measured: Measured, factors: tuple[VarianceFactor, ...]) -> _Fields:
         level: Level = "fair" if measured.control_points >= CONTROL_POINTS[1] else "unknown"
         return level, "none", "the control points alone place the survey", rule
     part = measured.fix_outliers / measured.fixes
-    level = level_of(part, FIX_OUTLIERS, more_is_better=False)
+    level = verdict_of(part, FIX_OUTLIERS, more_is_better=False)
     name, sigmas = measured.largest_fix or ("", 0.0)
     reason = "all fixes agree with each other within 3 σ"
     if measured.fix_outliers:
@@ -196,7 +196,7 @@ def _fixes(measured: Measured, factors: tuple[VarianceFactor, ...]) -> _Fields:
 
 def _control(measured: Measured) -> _Fields:
     count = measured.control_points
-    level: Level = level_of(count, CONTROL_POINTS, more_is_better=True) if count else "fair"
+    level: Level = verdict_of(count, CONTROL_POINTS, more_is_better=True) if count else "fair"
     reason = (
         "a common error of the recorded positions cannot be seen without control points"
         if not count
@@ -360,10 +360,10 @@ def _views(test: PhotometricFigures) -> _Fields:
     psnr_db, covered_db, covered_share = test.psnr, test.psnr_covered, test.covered_share
     if psnr_db is None:
         return "unknown", "none", "no photograph was left out of the training", rule
-    level = level_of(psnr_db, TEST_PSNR_DB, more_is_better=True)
+    level = verdict_of(psnr_db, TEST_PSNR_DB, more_is_better=True)
     reason = "renders look like the photographs" if level == "good" else "train longer, or at a larger image size"
     if level != "good" and covered_db is not None and covered_share is not None:
-        there = level_of(covered_db, TEST_PSNR_DB, more_is_better=True)
+        there = verdict_of(covered_db, TEST_PSNR_DB, more_is_better=True)
         if there != level or covered_db - psnr_db > _COVERAGE_DB:
             reason = (
                 f"the training photographs show {share(covered_share)} of the test views' ground, and there "

@@ -1,25 +1,22 @@
-"""Evaluated survey, which all sections show; test views, and curves of the training."""
+"""What several sections show: solution, report of `evaluate`, observations; test views, curves of the training."""
 
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.adjust.posterior import Posterior
-from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.stages import BY_NAME, METRICS, RENDERS, REPORT
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import project_each
-from pipelines.geometry.footprints import PointSurface
 from pipelines.geometry.intersection import refined_points
 from pipelines.geometry.network import Network, has_positive_depth
-from pipelines.report.options import ReportOptions
+from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.report.page import Picture, limited, picture_of, picture_of_png, read_picture
 from pipelines.report.plots.charts import without_labels
 from pipelines.report.plots.observations import curves
@@ -27,69 +24,35 @@ from pipelines.survey.area import LEAST_RAYS, without_outliers
 from pipelines.survey.photographs import DIFFERENCE_GAIN, render_name
 from pipelines.survey.report import EvaluationReport, PhotometricFigures, read_report
 from pipelines.survey.scene import network_of
-from pipelines.survey.target_crs import TargetCrs, usable_crs
-from pipelines.survey.trained_model import TrainedModel
-from pipelines.survey.trained_survey import SolvedSurvey, load_solved
+from pipelines.survey.solution import Solution, TrainedModel, read_solution
 
 
-@dataclass(frozen=True)
-class EvaluatedSurvey:
-    """Solved survey with the report of `evaluate`, the covariances of the solution, and the CRS of the page."""
-
-    workspace: Workspace
-    solved: SolvedSurvey
-    report: EvaluationReport
-    posterior: Posterior
-    crs: TargetCrs
-
-    @cached_property
-    def center_in_geo(self) -> FloatArray:
-        """Adjusted projection centres (n, 3), metres."""
-        return self.solved.geo_from_model.apply(self.solved.poses.cam_center_in_model)
-
-    @cached_property
-    def network(self) -> Network:
-        """The image observations with adjusted cameras and lenses, and points where these see them, in `model`."""
-        network = network_of(self.solved.sparse, self.solved.poses, self.solved.point_in_model)
-        return replace(network, point_in_world=refined_points(network).point_in_world)
-
-    @cached_property
-    def ray_in_cam(self) -> FloatArray:
-        """Observed points (M, 3) in the frames of their cameras, in lengths of `model`."""
-        network = self.network
-        ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
-        return np.asarray(np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], ray))
-
-    @cached_property
-    def residual_px(self) -> FloatArray:
-        """Reprojection residuals (M, 2), projected minus observed; NaN where a point lies behind its camera."""
-        network = self.network
-        projected = project_each(network.cameras, network.camera_id[network.obs_image], self.ray_in_cam)
-        return np.asarray(np.where(has_positive_depth(network)[:, None], projected - network.obs_xy_px, np.nan))
-
-    @cached_property
-    def scene_in_geo(self) -> FloatArray:
-        """SfM points (N, 3) in `geo` that three photographs show, without the highest and lowest."""
-        network = self.network
-        points = self.solved.geo_from_model.apply(network.point_in_world)
-        return without_outliers(points[np.bincount(network.obs_point, minlength=len(points)) >= LEAST_RAYS])
-
-    @cached_property
-    def surface(self) -> PointSurface | None:
-        """Surface through the points of the scene; None: there are none."""
-        return PointSurface(self.scene_in_geo) if len(self.scene_in_geo) else None
-
-
-def load_evaluated(workspace: Workspace, options: ReportOptions) -> EvaluatedSurvey:
-    """Return the evaluated survey of a workspace; errors as of the `run` of a stage."""
+def read_evaluated(workspace: Workspace) -> tuple[Solution, EvaluationReport]:
+    """Return the solution that `evaluate` has seen, and its report; errors as of the `run` of a stage."""
     report = read_report(workspace.path(REPORT))
     manifest = workspace.manifest(BY_NAME["evaluate"])  # None: a report put there by hand
     initial = manifest is not None and manifest.config.get("similarity") == "initial"
-    solved = load_solved(workspace, "initial" if initial else "trained")
-    center_in_geo = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
-    crs = usable_crs(options, solved.survey.origin, center_in_geo, solved.survey.vertical)
-    posterior = posterior_of(workspace, solved.model, solved.sfm)
-    return EvaluatedSurvey(workspace, solved, report, posterior, crs)
+    return read_solution(workspace, similarity="initial" if initial else "trained"), report
+
+
+def adjusted_network(solution: Solution, sfm: SparseModel) -> Network:
+    """Return the image observations with solved cameras and lenses, and points where these see them, in `model`."""
+    network = network_of(solution.with_lenses(sfm), solution.poses, solution.point_in_model(sfm))
+    return replace(network, point_in_world=refined_points(network).point_in_world)
+
+
+def reprojection_residuals(network: Network) -> FloatArray:
+    """Return projected minus observed (M, 2) in pixels; NaN where a point lies behind its camera."""
+    ray = network.point_in_world[network.obs_point] - network.cam_center_in_world[network.obs_image]
+    ray_in_cam = np.einsum("mij,mj->mi", network.cam_from_world[network.obs_image], ray)
+    projected = project_each(network.cameras, network.camera_id[network.obs_image], ray_in_cam)
+    return np.asarray(np.where(has_positive_depth(network)[:, None], projected - network.obs_xy_px, np.nan))
+
+
+def seen_scene(network: Network, geo_from_model: Similarity) -> FloatArray:
+    """Return the points (N, 3) in `geo` that three photographs of a network show, without highest and lowest."""
+    points = geo_from_model.apply(network.point_in_world)
+    return without_outliers(points[np.bincount(network.obs_point, minlength=len(points)) >= LEAST_RAYS])
 
 
 _VIEW_PX = 560
@@ -100,12 +63,11 @@ _PANELS: dict[str, dict[str, str]] = {
     "PSNR of the batch in dB": {"psnr": "PSNR"},
     "photometric loss": {"photometric": "loss"},
     "geographic terms": {
+        "solution": "motion from the solution",
         "absolute": "fixes",
         "control": "control points",
-        "earlier": "points in common with the earlier date",
-        "attitude": "attitudes",
+        "control_by_depth": "control points by depth",
         "relative": "distances",
-        "cameras": "corrections of the cameras",
     },
     "Gaussians": {"gaussians": "Gaussians"},
 }
@@ -164,13 +126,15 @@ def views_facts(workspace: Workspace, test: PhotometricFigures, most: int) -> Vi
 def _view(name: str, field: str, file: Path) -> TestView:
     parts = without_labels(read_picture(file), 3)
     if not parts[0].size:
-        message = "is no render of `georef evaluate`. Run `georef evaluate --force`."
-        raise InputError("not-a-render", message, path=file)
+        message = "is no render of `georef evaluate`."
+        remedy = "Run `georef evaluate --force`."
+        raise InputError("not-a-render", message, path=file, remedy=remedy)
     photograph, render, difference = (picture_of(limited(part, _VIEW_PX)) for part in parts)
     return TestView(name, field, photograph, render, difference)
 
 
 def training_facts(workspace: Workspace, model: TrainedModel) -> TrainingFacts:
+    """Return what the section on the training shows: model, curves over the iterations, time in seconds."""
     manifest, metrics = workspace.manifest(BY_NAME["train"]), workspace.root / METRICS
     panels = _panels(read_metrics(metrics)) if metrics.is_file() else {}
     return TrainingFacts(
@@ -194,8 +158,9 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
                 row = {name: float(value) for name, value in json.loads(line).items()}
                 rows.append(row | {"iteration": row["iteration"]})
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
-        message = "is no row of metrics. Run `georef train --force`."
-        raise InputError("metrics-row", message, path=path, line=lines) from error
+        message = "is no row of metrics."
+        remedy = "Run `georef train --force`."
+        raise InputError("metrics-row", message, path=path, line=lines, remedy=remedy) from error
     return rows
 
 

@@ -39,7 +39,7 @@ _ROBUST_ROUNDS = 3
 _MOST_STEPS = 100  # of a round
 _SETTLED_STEPS = 10  # of the last one with all tracks, after the cameras have settled with few
 _SETTLED = 0.01  # relative change of the residuals' scale
-_LEAST_SCALE_PX = 1e-3  # for observations without noise, which have no tails either
+LEAST_SCALE_PX = 1e-3  # for observations without noise, which have no tails either
 # Least gain of a step, as a fraction of the cost and times the number of observations; a smaller gain ends the
 # adjustment. In this unit an error of one σ in one parameter costs 1/2. COLMAP's own tolerance of zero runs to the
 # limit of 100 steps.
@@ -151,6 +151,17 @@ def _follow(colmap: Any, model: Any, leader: Any) -> None:
             model.frames[key].rig_from_world = frame.rig_from_world
 
 
+def place_points(colmap: Any, model: Any, threads: int = -1) -> None:
+    """Move the points of a `pycolmap.Reconstruction` to where its cameras see them, by robust least squares."""
+    adjustment = colmap.BundleAdjustmentOptions()
+    adjustment.print_summary = False
+    adjustment.ceres.solver_options.num_threads = threads
+    adjustment.ceres.solver_options.max_num_iterations = _MOST_STEPS
+    adjustment.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+    adjustment.ceres.loss_function_scale = CAUCHY_95 * max(rayleigh_sigma(residual_px(model)), LEAST_SCALE_PX)
+    _adjust_points(colmap, model, adjustment)
+
+
 def _adjust_points(colmap: Any, model: Any, adjustment: Any) -> None:
     """Move points to where the cameras see them."""
     points_alone = deepcopy(adjustment)
@@ -220,7 +231,7 @@ def _adjust_robustly(
     adjustment.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
     used_px = np.inf
     for left in reversed(range(_ROBUST_ROUNDS)):
-        scale_px = max(rayleigh_sigma(_residual_px(model)), _LEAST_SCALE_PX)
+        scale_px = max(rayleigh_sigma(residual_px(model)), LEAST_SCALE_PX)
         is_last = settled or left == 0 or abs(scale_px / used_px - 1) < _SETTLED
         adjustment.ceres.solver_options.function_tolerance = (1.0 if is_last else _COARSE) * _least_gain(model)
         adjustment.ceres.loss_function_scale = CAUCHY_95 * scale_px
@@ -231,7 +242,7 @@ def _adjust_robustly(
         used_px = scale_px
 
 
-def _residual_px(model: Any) -> FloatArray:
+def residual_px(model: Any) -> FloatArray:
     """Return the lengths (M,) of the residuals of all observations in pixels; NaN behind the camera."""
     flat = flatten(model)
     rotation = flat.rotation_cam_from_local[flat.obs_image]

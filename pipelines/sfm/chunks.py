@@ -207,9 +207,7 @@ def _planned(workspace: Workspace, name: str) -> Chunk:
     path = workspace.partial(BY_NAME["sfm"]) / PLAN
     if not path.is_file():
         raise InputError(
-            "no-chunk-plan",
-            f"No chunks are planned. Run `georef sfm {workspace.root}`.",
-            path=path,
+            "no-chunk-plan", "No chunks are planned.", path=path, remedy=f"Run `georef sfm {workspace.root}`."
         )
     chunks = load_json(ChunkPlan, path).chunks
     chunk = next((chunk for chunk in chunks if chunk.name == name), None)
@@ -218,8 +216,9 @@ def _planned(workspace: Workspace, name: str) -> Chunk:
         raise InputError("unknown-chunk", f"{name!r} is none of the chunks {names}", field="--chunk")
     count = len(load_json(Survey, workspace.path(SURVEY)).with_companions().images)
     if max((*chunk.images, *(index for pair in chunk.pairs for index in pair)), default=0) >= count:
-        message = f"{name} has more photographs than the survey. Run `georef sfm {workspace.root}`."
-        raise InputError("chunk-plan-outdated", message, path=path)
+        message = f"{name} has more photographs than the survey."
+        remedy = f"Run `georef sfm {workspace.root}`."
+        raise InputError("chunk-plan-outdated", message, path=path, remedy=remedy)
     return chunk
 
 

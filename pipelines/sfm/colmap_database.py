@@ -122,15 +122,30 @@ def add_features(
             new = np.concatenate([xy_px, np.tile(np.array(shape), (len(xy_px), 1))], axis=1).astype(np.float32)
             begin[index] = len(known)
             database.update_keypoints(index + 1, np.concatenate([known.reshape(-1, columns), new]))
-        for (a, b), rows in matches.items():
-            before = np.zeros((0, 2), dtype=np.uint32)
-            if database.exists_matches(a + 1, b + 1):
-                before = np.asarray(database.read_matches(a + 1, b + 1), dtype=np.uint32).reshape(-1, 2)
-                database.delete_matches(a + 1, b + 1)
-            if database.exists_two_view_geometry(a + 1, b + 1):
-                database.delete_two_view_geometry(a + 1, b + 1)
-            both = np.concatenate([before, np.add(rows, (begin[a], begin[b])).astype(np.uint32)])
-            database.write_matches(a + 1, b + 1, both)
+        shifted = {(a, b): np.add(rows, (begin[a], begin[b])) for (a, b), rows in matches.items()}
+        _write_matches(database, shifted)
+
+
+def add_matches(colmap: Any, path: Path, matches: Mapping[tuple[int, int], IntArray]) -> None:
+    """Add matches of features to those in a database; pairs that get some wait to be verified again.
+
+    `matches` are rows (M, 2) of the features of each pair of the photographs' indices in the survey.
+    """
+    with colmap.Database.open(path) as database, colmap.DatabaseTransaction(database):
+        _write_matches(database, matches)
+
+
+def _write_matches(database: Any, matches: Mapping[tuple[int, int], IntArray]) -> None:
+    for (a, b), rows in matches.items():
+        before = np.zeros((0, 2), dtype=np.uint32)
+        if database.exists_matches(a + 1, b + 1):
+            before = np.asarray(database.read_matches(a + 1, b + 1), dtype=np.uint32).reshape(-1, 2)
+            database.delete_matches(a + 1, b + 1)
+        if database.exists_two_view_geometry(a + 1, b + 1):
+            database.delete_two_view_geometry(a + 1, b + 1)
+        both = np.concatenate([before, np.asarray(rows, dtype=np.uint32)])
+        _, kept = np.unique(both, axis=0, return_index=True)
+        database.write_matches(a + 1, b + 1, both[np.sort(kept)])
 
 
 def has_added_features(colmap: Any, path: Path) -> bool:
@@ -169,6 +184,7 @@ def finish_database(draft: Path, final: Path, *, without: Iterable[str] = ()) ->
 
 
 def remove_database(path: Path) -> None:
+    """Remove a database of SQLite, if it exists, with what its journals hold."""
     for suffix in ("", "-wal", "-shm", "-journal"):
         remove(path.with_name(path.name + suffix))
 

@@ -17,12 +17,12 @@ from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks, remove_chunks, wo
 from pipelines.sfm.colmap_database import require_sound
 from pipelines.sfm.estimate import estimate_reconstruction, why_too_large
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
+from pipelines.sfm.global_shutter_points import correct_tie_points
 from pipelines.sfm.learned_weights import learned_remedy
 from pipelines.sfm.lens_check import lenses_astray
 from pipelines.sfm.mapping import triangulate
 from pipelines.sfm.options import SfmOptions
 from pipelines.sfm.rigs import reference_alone, with_rigs
-from pipelines.sfm.rolling_shutter import correct_tie_points
 from pipelines.sfm.rounds import map_in_rounds
 from pipelines.survey.survey import Survey
 
@@ -83,9 +83,9 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> tuple[Any, bool
     if missing:
         raise InputError(
             "photograph-missing",
-            f"{len(missing)} photographs of the survey are missing, such as this one. Restore them, or run "
-            "`georef ingest` again.",
+            f"{len(missing)} photographs of the survey are missing, such as this one.",
             path=job.images / missing[0],
+            remedy="Restore them, or run `georef ingest` again.",
         )
     colmap.set_random_seed(job.options.seed)
     extract_features(colmap, job, range(len(job.survey.images)), progress)
@@ -104,7 +104,7 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> tuple[Any, bool
         raise DegenerateGeometryError(
             "no-matches",
             "No two photographs could be matched: overlap or texture is too low. Try a larger --max-features, or "
-            f"--pairs exhaustive.{learned_remedy(job.options.features)}",
+            f"--pairs exhaustive. {learned_remedy(job.options.features)}".rstrip(),
         )
     model, complete, fixes = aligned.models[0], None, None
     if len(job.survey.images) > _DRIFTLESS_UP_TO:

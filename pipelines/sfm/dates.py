@@ -34,9 +34,10 @@ from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.sfm.colmap_database import FEATURES, copy_rows, drop_added_features, remove_database
 from pipelines.sfm.features import MAX_ANGLE_DEG, SfmJob, spread_of, steps, verification
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.common_points import CommonPoints, solution_hash
+from pipelines.survey.solution import read_sfm, read_solution
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_survey import SolvedSurvey, load_cameras
 
 log = logging.getLogger(__name__)
 
@@ -54,15 +55,16 @@ _FARTHEST_M = 30.0  # between the positions of both dates beyond that reach: con
 
 
 @dataclass(frozen=True)
-class EarlierDate:
+class SolvedDate:
     """Earlier date as it was solved: its survey, SfM model and posterior; read only."""
 
     workspace: Workspace
-    solved: SolvedSurvey
+    survey: Survey
+    sfm: SparseModel
     posterior: Posterior
 
     @classmethod
-    def load(cls, root: Path, later: Survey) -> "EarlierDate":
+    def load(cls, root: Path, later: Survey) -> "SolvedDate":
         """Read the earlier date of a later survey.
 
         Raises:
@@ -71,35 +73,37 @@ class EarlierDate:
                 the two lie apart.
         """
         workspace = Workspace(root)
-        solved = load_cameras(workspace)
-        if solved.survey.origin is None or later.origin is None:
-            which = "The earlier" if solved.survey.origin is None else "This"
+        solution = read_solution(workspace)
+        sfm, survey = read_sfm(workspace, solution), solution.weighted(load_survey(workspace))
+        if survey.origin is None or later.origin is None:
+            which = "The earlier" if survey.origin is None else "This"
             message = (
                 f"{which} survey has a local metric frame and no place on Earth, which two dates need to share."
             )
             raise InputError("not-on-earth", message, path=root, field="--earlier")
         if not workspace.has(DATABASE):
-            message = "has no features (sfm/database.db), as an imported model has none. Solve it from photographs."
-            raise InputError("earlier-without-features", message, path=root, field="--earlier")
-        date = cls(workspace, solved, posterior_of(workspace, solved.model, solved.sfm))
+            message = "has no features (sfm/database.db), as an imported model has none."
+            remedy = "Solve it from photographs."
+            raise InputError("earlier-without-features", message, path=root, field="--earlier", remedy=remedy)
+        date = cls(workspace, survey, sfm, posterior_of(workspace, solution, sfm))
         date._require_near(later)
         return date
 
     @cached_property
     def center_in_ecef(self) -> FloatArray:
         """Solved projection centres (n, 3)."""
-        center = self.solved.geo_from_model.apply(self.solved.poses.cam_center_in_model)
-        return ecef_from_enu(center, self.solved.survey.origin_on_earth)
+        return ecef_from_enu(self.posterior.solution.center_in_geo, self.survey.origin_on_earth)
 
     @cached_property
     def axis_in_ecef(self) -> FloatArray:
         """Solved optical axes (n, 3)."""
-        in_geo = self.solved.poses.cam_from_model[:, 2] @ self.solved.geo_from_model.rotation.T
-        return np.asarray(in_geo @ ecef_from_enu_rotation(lla_of(self.solved.survey.origin_on_earth)).T)
+        solution = self.posterior.solution
+        in_geo = solution.poses.cam_from_model[:, 2] @ solution.similarity.rotation.T
+        return np.asarray(in_geo @ ecef_from_enu_rotation(lla_of(self.survey.origin_on_earth)).T)
 
     @cached_property
     def at(self) -> Solved:
-        return Solved(self.posterior, self.solved.survey.origin_on_earth)
+        return Solved(self.posterior, self.survey.origin_on_earth)
 
     def _require_near(self, later: Survey) -> None:
         position, _ = _recorded(later)
@@ -107,7 +111,7 @@ class EarlierDate:
         if not known.any():
             return
         distance, _ = cKDTree(self.center_in_ecef).query(position[known])
-        rays = np.linalg.norm(self.at.network.rays(), axis=1) * self.solved.geo_from_model.scale
+        rays = np.linalg.norm(self.at.network.rays(), axis=1) * self.posterior.solution.similarity.scale
         reach_m = _REACH * float(np.median(rays)) + _FARTHEST_M
         if float(distance.min()) > reach_m:
             message = (
@@ -117,7 +121,7 @@ class EarlierDate:
             raise InputError("earlier-apart", message, path=self.workspace.root, field="--earlier")
 
 
-def tie_to_earlier(colmap: Any, job: SfmJob, model: Any, earlier: EarlierDate, progress: Progress) -> CommonPoints:
+def tie_to_earlier(colmap: Any, job: SfmJob, model: Any, earlier: SolvedDate, progress: Progress) -> CommonPoints:
     """Return the points that a `pycolmap.Reconstruction` has in common with an earlier date.
 
     Raises:
@@ -131,12 +135,12 @@ def tie_to_earlier(colmap: Any, job: SfmJob, model: Any, earlier: EarlierDate, p
     if chosen is None or len(chosen.later) < _LEAST:
         found = 0 if chosen is None else len(chosen.later)
         message = (
-            f"{len(pairs)} pairs of photographs across the dates have {tied.matches} verified matches, which tie "
-            f"{found} points that agree; {_LEAST} are needed. Nothing on the ground looks the same at both dates, "
-            "or scale, season or light differ too much. Try a larger --max-features, or solve this date alone: "
-            "--forget earlier."
+            f"{len(pairs)} pairs of photographs across the dates have {tied.matches} verified matches, which "
+            f"tie {found} points that agree; {_LEAST} are needed. Nothing on the ground looks the same at both "
+            "dates, or scale, season or light differ too much."
         )
-        raise DegenerateGeometryError("earlier-not-tied", message)
+        remedy = "Try a larger --max-features, or solve this date alone: --forget earlier."
+        raise DegenerateGeometryError("earlier-not-tied", message, remedy=remedy)
     points = _placed(chosen, earlier)
     log.info(
         "%d points tie the dates, of %d verified matches in %d pairs; they cover %.0f %% of the ground in common.",
@@ -145,7 +149,7 @@ def tie_to_earlier(colmap: Any, job: SfmJob, model: Any, earlier: EarlierDate, p
     return points
 
 
-def pairs_across(survey: Survey, model: Any, earlier: EarlierDate) -> list[tuple[int, int]]:
+def pairs_across(survey: Survey, model: Any, earlier: SolvedDate) -> list[tuple[int, int]]:
     """Return the pairs (later image id, index of an earlier camera) that may show the same place.
 
     Few pairs are all taken. Otherwise, half of a photograph's partners are the nearest that look in a similar
@@ -193,16 +197,16 @@ class _Ties:
     matches: int  # verified ones, of all features
     spread: float = 0.0
 
-    def agreeing(self, model: SparseModel, earlier: EarlierDate) -> "_Ties | None":
+    def agreeing(self, model: SparseModel, earlier: SolvedDate) -> "_Ties | None":
         """Return the pairs that agree on a similarity, thinned to an even number in each block; None: none does."""
-        sfm = earlier.solved.sfm
+        sfm, solution = earlier.sfm, earlier.posterior.solution
         row = _rows(model.point_id, self.later)
         other = _rows(sfm.point_id, self.earlier)
         known = (row >= 0) & (other >= 0)
         row, other = row[known], other[known]
         if len(row) < 3:
             return None
-        in_geo = earlier.solved.geo_from_model.apply(earlier.solved.point_in_model)
+        in_geo = solution.similarity.apply(solution.point_in_model(sfm))
         try:
             similarity, near = common_similarity(model.point_in_local[row], in_geo[other], np.random.default_rng(0))
         except DegenerateGeometryError:
@@ -255,7 +259,7 @@ def _spread(place: FloatArray, ground: tuple[FloatArray, FloatArray]) -> float:
     return len(occupied(place) & inside) / max(len(inside), 1)
 
 
-def _placed(ties: _Ties, earlier: EarlierDate) -> CommonPoints:
+def _placed(ties: _Ties, earlier: SolvedDate) -> CommonPoints:
     """Return pairs of tracks with their places by the earlier solution."""
     position, cov = earlier.at.placed(ties.earlier)
     known: BoolArray = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
@@ -272,7 +276,7 @@ def _placed(ties: _Ties, earlier: EarlierDate) -> CommonPoints:
         spread=np.asarray(ties.spread),
         found=np.asarray(int(known.sum())),
         factor=np.asarray(1.0),
-        checked=np.asarray(is_checked(earlier.solved.model.cautions)),
+        checked=np.asarray(is_checked(earlier.posterior.solution.cautions)),
         earlier=str(earlier.workspace.root.absolute()),
         solution=solution_hash(earlier.workspace),
     )
@@ -350,7 +354,7 @@ def _is_best(pair: tuple[int, int], best: tuple[dict[int, tuple[int, int]], ...]
 
 
 @contextmanager
-def _both_dates(colmap: Any, job: SfmJob, model: Any, earlier: EarlierDate) -> Iterator[_BothDates]:
+def _both_dates(colmap: Any, job: SfmJob, model: Any, earlier: SolvedDate) -> Iterator[_BothDates]:
     """Make a database of the registered photographs of both dates with their features; it is removed at the end."""
     path = job.database.with_name("dates.db")
     other = load_reconstruction(earlier.workspace.path(SPARSE))
@@ -368,7 +372,7 @@ def _both_dates(colmap: Any, job: SfmJob, model: Any, earlier: EarlierDate) -> I
         except DamagedPartialError as error:
             raise InputError("earlier-features", str(error), field="--earlier") from error
         drop_added_features(path)
-        yield _BothDates(path, first, model, other, earlier.solved.sfm.image_id)
+        yield _BothDates(path, first, model, other, earlier.sfm.image_id)
     finally:
         remove_database(path)
 

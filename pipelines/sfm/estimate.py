@@ -1,23 +1,32 @@
 """Estimate of a reconstruction by COLMAP: mapper, chunks, time and memory for the photographs of a survey.
 
-`jobs.costs` has the constants. The largest photographs of a survey have `photo_px` pixels, width and height.
+The largest photographs of a survey have `photo_px` pixels, width and height.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from pipelines.core.machine import chosen_threads, free_main_memory_bytes
 from pipelines.core.sentences import about
-from pipelines.jobs.costs import (
-    MEASURED_CORES,
-    ReconstructionCost,
-    features_peak_bytes,
-    mapping_peak_bytes,
-    reconstruction_cost,
-)
+from pipelines.jobs.costs import COSTS, MEASURED_CORES, Work, cores_factor
 from pipelines.sfm.mapping import MapperName, chosen_mapper
 from pipelines.sfm.options import SfmOptions
 
 _USABLE = 0.9  # of the free memory: other programs grow, too
+# Features a megapixel of aerial photographs, about, of doubled ones and of others, and their number for which the
+# cost of a pair holds: matching compares each feature of a photograph with each of the other.
+_FEATURES_MEGAPIXEL, _OWN_SIZE_FEATURES_MEGAPIXEL, _PAIR_FEATURES = 6000, 3000, 5000
+_FIXED_BYTES = 300 << 20  # interpreter, libraries, reserves of the allocator
+# Bytes a pixel of the photograph, and of the image that features are detected in, by thread: measured with
+# photographs of 2.3 and 20.9 megapixels at 600, 1200 and 2400 px, where they are 1.04 to 1.28 times the growth.
+# Photographs that are not doubled: 79 to 91 bytes at 1200, 1600 and 3200 px.
+_PHOTO_BYTES_PX, _DETECTION_BYTES_PX, _OWN_SIZE_DETECTION_BYTES_PX = 4.0, 310.0, 95.0
+# Mapping and the adjustments after it, of the global mapper, which needs more than the incremental one
+# (`examples/benchmarks/many_photographs.py`; its results/scale.md has the runs).
+_FEATURE_BYTES, _OBSERVATION_BYTES = 133.0, 2500.0
+# Features that COLMAP finds and observations of points, as multiples of `--max-features`: eight surveys had up to
+# 1.5 and, with real photographs, 0.14 to 0.32.
+_FOUND, _OBSERVED = 1.5, 0.35
 
 
 @dataclass(frozen=True)
@@ -45,46 +54,62 @@ class ReconstructionEstimate:
 def estimate_reconstruction(
     photographs: int, photo_px: tuple[int, int], options: SfmOptions
 ) -> ReconstructionEstimate:
-    from pipelines.jobs.calibration import machine_factor  # and torch, which a reconstruction does not need
+    """Return time (seconds) and memory (bytes) of a reconstruction on this machine, and why it is refused, if so.
 
+    `photo_px` is the photographs' width and height.
+    """
     free_bytes = free_main_memory_bytes()
     return ReconstructionEstimate(
         photographs=photographs,
         mapper=chosen_mapper(photographs, options),
         chunks=options.chunks(photographs),
-        seconds=estimated_cost(photographs, photo_px, options).total_s / MEASURED_CORES * machine_factor(),
+        seconds=sum(estimated_cost(photographs, photo_px, options)) / MEASURED_CORES * cores_factor(),
         peak_bytes=peak_bytes(photographs, photo_px, options),
         free_bytes=free_bytes,
         refusal=why_too_large(photographs, photo_px, options, free_bytes) or "",
     )
 
 
+class ReconstructionCost(NamedTuple):
+    """Seconds of one core for the steps of a reconstruction."""
+
+    features_s: float
+    matching_s: float
+    mapping_s: float
+
+
 def estimated_cost(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> ReconstructionCost:
     """Return about how many seconds one core needs for each step."""
+    doubled = options.doubles(photo_px)
+    megapixels = photo_px[0] * photo_px[1] / _shrink(photo_px, options) ** 2 / 1e6
     every = photographs * (photographs - 1) / 2
-    shrink = max(max(photo_px) / options.max_image_size, 1.0)  # by which features are detected on smaller images
     # Half of the largest number of neighbours: most pairs are chosen by both of their images.
     pairs = every if options.pairs == "exhaustive" else min(every, photographs * options.max_neighbors / 2)
-    return reconstruction_cost(
-        photographs,
-        photo_px[0] * photo_px[1] / shrink**2 / 1e6,
-        pairs,
-        doubled=options.doubles(photo_px),
-        max_features=options.max_features,
-    )
+    found = megapixels * (_FEATURES_MEGAPIXEL if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL)
+    compared = pairs * (min(found, options.max_features) / _PAIR_FEATURES) ** 2
+    work = Work(photographs=photographs, megapixels=photographs * megapixels, pairs=compared)
+    steps = ("features" if doubled else "features at own size", "matching", "mapping")
+    return ReconstructionCost(*(MEASURED_CORES * COSTS[step].of(work) for step in steps))
+
+
+def _shrink(photo_px: tuple[int, int], options: SfmOptions) -> float:
+    """Return the factor, at least 1, by which the images are smaller that features are detected in."""
+    return max(max(photo_px) / options.max_image_size, 1.0)
 
 
 def chunk_peak_bytes(photo_px: tuple[int, int], options: SfmOptions, threads: int = 1) -> int:
     """Return the peak of a process that detects or matches features in so many threads."""
-    pixels, doubled = photo_px[0] * photo_px[1], options.doubles(photo_px)
-    shrink = max(max(photo_px) / options.max_image_size, 1.0)
-    return features_peak_bytes(pixels, shrink, doubled=doubled, threads=threads)
+    pixels = photo_px[0] * photo_px[1]
+    detection = _DETECTION_BYTES_PX if options.doubles(photo_px) else _OWN_SIZE_DETECTION_BYTES_PX
+    a_thread = _PHOTO_BYTES_PX * pixels + detection * pixels / _shrink(photo_px, options) ** 2
+    return int(_FIXED_BYTES + threads * a_thread)
 
 
 def peak_bytes(photographs: int, photo_px: tuple[int, int], options: SfmOptions) -> int:
-    """Return the peak of the memory of a reconstruction on this machine."""
+    """Return the peak of the memory of a reconstruction on this machine: of its features or of its mapping."""
     features = chunk_peak_bytes(photo_px, options, chosen_threads(options.threads))
-    return max(features, mapping_peak_bytes(photographs, options.max_features))
+    a_photograph = (_FEATURE_BYTES * _FOUND + _OBSERVATION_BYTES * _OBSERVED) * options.max_features
+    return max(features, int(_FIXED_BYTES + photographs * a_photograph))
 
 
 def why_too_large(

@@ -74,7 +74,8 @@ _EXHAUSTIVE_UP_TO = 20
 _IMAGES_PER_STEP = 4
 _PAIRS_PER_STEP = 48
 # Draws of RANSAC for a pair: they find an essential matrix that 32 % of the matches obey, with a probability of
-# 99.9 %. Pairs without a common place would use up COLMAP's 10 000 (docs/benchmarks.md, Time to quality).
+# 99.9 %. Pairs without a common place would use up COLMAP's 10 000 (examples/benchmarks/results/training.md,
+# "Time to quality").
 _MOST_TRIALS = 2_000
 
 
@@ -205,6 +206,7 @@ def verify_matches(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress
 
 
 def verification(colmap: Any, job: SfmJob) -> Any:
+    """Return COLMAP's options of the geometric verification of a pair, with the job's seed."""
     options = colmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job.options.seed
     options.ransac.max_num_trials = _MOST_TRIALS
@@ -248,5 +250,6 @@ def _number(index: int) -> str:
 
 
 def steps(items: Any, size: int) -> Iterator[Any]:
+    """Yield the items in slices of `size`; the last may be shorter."""
     for begin in range(0, len(items), size):
         yield items[begin : begin + size]

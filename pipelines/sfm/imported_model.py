@@ -3,10 +3,12 @@
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Self
 
 from pipelines.core.errors import InputError
+from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress
 from pipelines.core.workspace import StageRun
 from pipelines.formats.colmap import (
@@ -22,7 +24,8 @@ from pipelines.sfm.colmap_reconstruction import ColmapReconstructor
 from pipelines.sfm.estimate import ReconstructionEstimate, estimate_reconstruction
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.foreign_cameras import foreign_file
-from pipelines.sfm.known_poses import triangulated_from
+from pipelines.sfm.imported_adjustment import Rule, settle_imported
+from pipelines.sfm.known_poses import triangulated_again, triangulated_from
 from pipelines.sfm.model_poses import check_observations
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.image_names import ImageNames
@@ -40,10 +43,14 @@ _SEEN = 0.5  # of the images with a pose: where fewer have observations, the mod
 
 @dataclass(frozen=True)
 class ImportedModel:
-    """Import of solved cameras from a path; without `triangulates` nothing is computed."""
+    """Import of solved cameras from a path; without `triangulates` no features are computed.
+
+    `foreign`: the file is another program's than COLMAP's.
+    """
 
     path: Path
     triangulates: bool = False
+    foreign: bool = False
     remedy: str = "COLMAP cannot read the imported model: export it again"
 
     @classmethod
@@ -54,7 +61,7 @@ class ImportedModel:
             InputError: the path is a file without such cameras.
         """
         file = foreign_file(path)
-        return cls(path, triangulates or (file is not None and not file.has_points))
+        return cls(path, triangulates or (file is not None and not file.has_points), file is not None)
 
     def estimate(
         self, photographs: int, photo_px: tuple[int, int], options: SfmOptions
@@ -74,15 +81,38 @@ class ImportedModel:
         with quiet_colmap() as colmap:
             if self.triangulates:
                 model, folder = import_poses(self.path, job.survey)
-                model = triangulated_from(colmap, model, job, folder, progress)
-                model.update_point_3d_errors()
+                held = self._rule(job.options) == "hold"
+                model = triangulated_from(colmap, model, job, folder, progress, held=held)
+                model = self._settled(colmap, model, job, progress)
                 check_observations(flatten(model), folder)
+                model.extract_colors_for_all_images(job.images)
             else:
-                model = import_model(self.path, job.survey)
+                model = self._settled(colmap, import_model(self.path, job.survey), job, progress)
+            model.update_point_3d_errors()
             write_reconstruction(model, job.sparse)
         if self.triangulates:
             remove_chunks(job.database.parent)
         return model
+
+    def _rule(self, options: SfmOptions) -> Rule:
+        if options.adjust_imported != "auto":
+            return "adjust" if options.adjust_imported == "yes" else "hold"
+        return "judge" if self.foreign and not options.triangulate else "hold"
+
+    def _settled(self, colmap: Any, model: Any, job: SfmJob, progress: Progress) -> Any:
+        """Return the model, adjusted where options and tie points say so; COLMAP's own stays as it is, unjudged."""
+        if job.options.adjust_imported == "auto" and not self.triangulates and not self.foreign:
+            return model
+        again = partial(triangulated_again, colmap, database=job.database, progress=progress)
+        return settle_imported(
+            colmap,
+            model,
+            self._rule(job.options),
+            again=again if self.triangulates else None,
+            principal_point=job.options.principal_point,
+            threads=chosen_threads(job.options.threads),
+            progress=progress,
+        )
 
 
 def import_model(path: Path, survey: Survey) -> Any:
@@ -117,7 +147,7 @@ def import_poses(path: Path, survey: Survey, *, says: bool = True) -> tuple[Any,
         source = file.path
         solved = file.read(source, _photo_size(survey, source))
         for remark in solved.remarks:
-            warn("%s", remark.sentence, extra={"code": remark.code})
+            warn("%s", remark.text, extra={"code": remark.code})
         model = reconstruction_of(solved.model)
     foreign = _rename(model, survey, source, warn)
     for frame_id in {image.frame_id for image in foreign}:  # The images of a rig share a frame.
@@ -127,10 +157,13 @@ def import_poses(path: Path, survey: Survey, *, says: bool = True) -> tuple[Any,
         example = others[0] if others else "none"
         raise InputError(
             "too-few-images-in-survey",
-            f"{model.num_reg_images()} of its images are in the survey, and at least three are needed. The model "
-            f"has {example!r} …, the survey {survey.images[0].name!r} …: names may differ in folder, case and "
-            "suffix only. Give `georef ingest` the photographs of the model, or rename its images.",
+            (
+                f"{model.num_reg_images()} of its images are in the survey, and at least three are needed. The "
+                f"model has {example!r} …, the survey {survey.images[0].name!r} …: names may differ in folder, "
+                "case and suffix only."
+            ),
             path=source,
+            remedy="Give `georef ingest` the photographs of the model, or rename its images.",
         )
     if others:
         warn("%d images of the imported model are not in the survey, and were left out.", len(others))
@@ -273,10 +306,15 @@ def _check_cameras(model: Any, survey: Survey, folder: Path, warn: Callable[...,
             cause = "undistorted copies" if undistorted else "copies of another size"
             raise InputError(
                 "undistorted-copies" if undistorted else "photograph-size",
-                f"Its camera {image.camera_id} ({camera.model_name}) has {camera.width}×{camera.height} pixels, "
-                f"the photograph {image.name} {width}×{height}: the model was made of {cause}. Import the model of "
-                "the photographs themselves, or give the folder of the copies to `georef ingest --images`.",
+                (
+                    f"Its camera {image.camera_id} ({camera.model_name}) has {camera.width}×{camera.height} "
+                    f"pixels, the photograph {image.name} {width}×{height}: the model was made of {cause}."
+                ),
                 path=folder,
+                remedy=(
+                    "Import the model of the photographs themselves, or give the folder of the copies to `georef "
+                    "ingest --images`."
+                ),
             )
         if undistorted:
             flat.add(image.camera_id)

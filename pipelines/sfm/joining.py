@@ -18,7 +18,7 @@ from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress, ProgressTask
 from pipelines.geometry.statistics import CAUCHY_95
 from pipelines.sfm.features import SfmJob
-from pipelines.sfm.mapping import MapperRun, lens_of, run_mapper, scratch_beside
+from pipelines.sfm.mapping import MapperRun, replaced_lens, run_mapper, scratch_beside
 from pipelines.sfm.match_ties import Tie, side_of, tie
 from pipelines.sfm.parts import add_part
 
@@ -125,7 +125,7 @@ def _models_apart(colmap: Any, job: SfmJob, whole: Any) -> list[Any]:
         return []
     used = {whole.images[image_id].camera_id for image_id in inside}
     lens = {camera_id: whole.cameras[camera_id].params.copy() for camera_id in used}
-    with lens_of(colmap, job.database, lens), scratch_beside(job.database) as scratch:
+    with replaced_lens(colmap, job.database, lens), scratch_beside(job.database) as scratch:
         threads = chosen_threads(job.options.threads)
         run = MapperRun(job.database, job.images, scratch, threads, job.options.seed, True, names, _FEWEST_OF_PART)
         return run_mapper(colmap, "incremental", run, lambda: None)

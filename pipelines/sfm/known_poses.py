@@ -8,21 +8,25 @@ import numpy as np
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import load_json
 from pipelines.core.progress import Progress
-from pipelines.core.types import FloatArray
 from pipelines.formats.colmap import flatten
 from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks
 from pipelines.sfm.colmap_database import require_sound
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
 from pipelines.sfm.mapping import triangulate
-from pipelines.sfm.model_poses import check_matches
+from pipelines.sfm.model_poses import Matches, check_matches, epipolar_error_px
 
 _LEAST_POINTS = 10
+_LIMIT_PX = 4.0  # COLMAP's own
+_LIMIT_OF_EPIPOLAR = 8.0  # times the median distance of matches: nearly all that are right, across the line too
 
 
-def triangulated_from(colmap: Any, imported: Any, job: SfmJob, folder: Path, progress: Progress) -> Any:
-    """Return a model with poses and lenses of an imported `pycolmap.Reconstruction`, and points from matches.
+def triangulated_from(
+    colmap: Any, imported: Any, job: SfmJob, folder: Path, progress: Progress, *, held: bool
+) -> Any:
+    """Return a model with poses and lenses of an imported `pycolmap.Reconstruction`, and points without colour.
 
-    Poses and lenses are held fixed. Images that the imported model lacks have no pose.
+    Poses and lenses are not changed. Images that the imported model lacks have no pose. Of poses not `held`
+    later, observations beyond COLMAP's limit are kept if the poses are as inaccurate (`triangulated_again`).
 
     Raises:
         InputError: the poses contradict the matches; names the convention that fits.
@@ -39,11 +43,28 @@ def triangulated_from(colmap: Any, imported: Any, job: SfmJob, folder: Path, pro
     model = _with_numbers_of(colmap, imported, job.database)
     matches = _matches(colmap, model, job.database)
     check_matches(flatten(model), matches, folder)
-    triangulate(colmap, model, job.database, progress)
+    limit_px = _LIMIT_PX if held else _limit_px(model, matches)
+    triangulate(colmap, model, job.database, progress, limit_px=limit_px)
     if model.num_points3D() < _LEAST_POINTS:
         raise _without_points(model, sum(len(pixels) for pixels, _ in matches.values()), len(matches))
-    model.extract_colors_for_all_images(job.images)
     return model
+
+
+def triangulated_again(colmap: Any, model: Any, database: Path, progress: Progress) -> Any:
+    """Return the cameras of a `pycolmap.Reconstruction` of this database with points triangulated anew.
+
+    The limit of an observation follows the distances of the matches from their epipolar lines: with COLMAP's own,
+    cameras with the largest errors would lose the observations that show these.
+    """
+    limit_px = _limit_px(model, _matches(colmap, model, database))
+    bare = type(model)(model)
+    bare.delete_all_points2D_and_points3D()
+    triangulate(colmap, bare, database, progress, limit_px=limit_px)
+    return bare
+
+
+def _limit_px(model: Any, matches: Matches) -> float:
+    return max(_LIMIT_PX, _LIMIT_OF_EPIPOLAR * epipolar_error_px(flatten(model), matches))
 
 
 def _without_points(model: Any, matches: int, pairs: int) -> DegenerateGeometryError:
@@ -52,9 +73,11 @@ def _without_points(model: Any, matches: int, pairs: int) -> DegenerateGeometryE
     if matches < _LEAST_POINTS:
         return DegenerateGeometryError(
             "no-matches",
-            f"{found}: {matches} verified matches were found between the {model.num_images()} photographs. They do "
-            "not show the same ground, or it lacks texture; poses play no part in that. Check that the photographs "
-            "overlap, and are those of the model.",
+            (
+                f"{found}: {matches} verified matches were found between the {model.num_images()} "
+                "photographs. They do not show the same ground, or it lacks texture; poses play no part in that."
+            ),
+            remedy="Check that the photographs overlap, and are those of the model.",
         )
     return DegenerateGeometryError(
         "no-points-triangulated",
@@ -93,7 +116,7 @@ def _with_numbers_of(colmap: Any, imported: Any, database: Path) -> Any:
     return model
 
 
-def _matches(colmap: Any, model: Any, database: Path) -> dict[tuple[int, int], tuple[FloatArray, FloatArray]]:
+def _matches(colmap: Any, model: Any, database: Path) -> Matches:
     """Return pixels of the verified matches between the posed images, by rows of the flat model."""
     row_of = {int(image_id): row for row, image_id in enumerate(sorted(model.reg_image_ids()))}
     found = {}

@@ -30,6 +30,7 @@ FETCH = "georef doctor --fetch-weights"
 
 
 def weights_folder() -> Path:
+    """Return the folder of the user's cache that holds the weights of learned features."""
     return user_cache() / "weights"
 
 
@@ -45,9 +46,9 @@ def missing_for_learned() -> str | None:
 def learned_remedy(features: str) -> str:
     """Return the sentence that learned features may connect what `--features` has left apart; empty: none."""
     if features == "sift":
-        return " Learned features may connect them: --features auto."
+        return "Learned features may connect them: --features auto."
     missing = missing_for_learned()
-    return "" if missing is None else f" Learned features may connect them; {missing}."
+    return "" if missing is None else f"Learned features may connect them; {missing}."
 
 
 def weights_file(name: str) -> Path:
@@ -58,10 +59,10 @@ def weights_file(name: str) -> Path:
     """
     path = weights_folder() / name
     if not path.is_file():
-        raise InputError("weights-missing", f"The weights are missing. Run `{FETCH}`.", path=path)
+        raise InputError("weights-missing", "The weights are missing.", path=path, remedy=f"Run `{FETCH}`.")
     if _hash(path.read_bytes()) != _SHA256[name]:
         raise InputError(
-            "weights-changed", f"The weights are not those of {_WHEEL}. Run `{FETCH}` again.", path=path
+            "weights-changed", f"The weights are not those of {_WHEEL}.", path=path, remedy=f"Run `{FETCH}` again."
         )
     return path
 

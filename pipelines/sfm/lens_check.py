@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.formats.colmap import lens_of_colmap
 from pipelines.geometry.cameras import Camera, undistort
 from pipelines.survey.survey import FOCAL_DIFFERS, Survey
 
@@ -21,7 +22,7 @@ def lenses_astray(model: Any, survey: Survey) -> dict[int, str]:
     astray = {}
     for camera_id in sorted(used & set(priors)):
         solved, prior = model.cameras[camera_id], priors[camera_id]
-        lens = Camera(solved.model_name, int(solved.width), int(solved.height), np.array(solved.params))
+        lens = lens_of_colmap(solved)
         if prior.focal_factor(lens) > FOCAL_DIFFERS:
             stated_px = prior.camera.mean_focal_px
             astray[camera_id] = (

@@ -44,6 +44,7 @@ class MapperRun:
 
 
 def chosen_mapper(photographs: int, options: SfmOptions) -> MapperName:
+    """Return the mapper that the options name, else the one for so many photographs."""
     if options.mapper != "auto":
         return options.mapper
     return "incremental" if photographs <= _INCREMENTAL_UP_TO else "global"
@@ -115,7 +116,7 @@ def _models(colmap: Any, mapper: MapperName, job: SfmJob, progress: Progress, *,
 
 
 @contextmanager
-def lens_of(colmap: Any, path: Path, params: Mapping[int, Any]) -> Iterator[None]:
+def replaced_lens(colmap: Any, path: Path, params: Mapping[int, Any]) -> Iterator[None]:
     """Give cameras in a database other parameters for a while."""
     with colmap.Database.open(path) as database:
         stated = {camera.camera_id: camera for camera in database.read_all_cameras() if camera.camera_id in params}
@@ -134,11 +135,20 @@ def _write_params(database: Any, cameras: Mapping[int, Any], params: Mapping[int
         database.update_camera(camera)
 
 
-def triangulate(colmap: Any, model: Any, database: Path, progress: Progress) -> None:
-    """Add the tracks of a database to a `pycolmap.Reconstruction` of known cameras, in place."""
+def triangulate(
+    colmap: Any, model: Any, database: Path, progress: Progress, *, limit_px: float | None = None
+) -> None:
+    """Add the tracks of a database to a `pycolmap.Reconstruction` of known cameras, in place.
+
+    Observations further than `limit_px` from their point are left out; without it, COLMAP's 4 px.
+    """
     with colmap.Database.open(database) as opened:
         cache = colmap.DatabaseCache.create(opened, colmap.DatabaseCacheOptions())
     mapper, options = colmap.IncrementalMapper(cache), colmap.IncrementalTriangulatorOptions()
+    filters = colmap.IncrementalMapperOptions()
+    if limit_px is not None:
+        options.merge_max_reproj_error = options.complete_max_reproj_error = limit_px
+        filters.filter_max_reproj_error = limit_px
     mapper.begin_reconstruction(model)
     images = sorted(model.reg_image_ids())
     with progress.task("triangulation", len(images)) as task:
@@ -146,7 +156,7 @@ def triangulate(colmap: Any, model: Any, database: Path, progress: Progress) -> 
             mapper.triangulate_image(options, image_id)
             task.advance()
         mapper.complete_and_merge_tracks(options)
-        mapper.filter_points(colmap.IncrementalMapperOptions())
+        mapper.filter_points(filters)
     mapper.end_reconstruction(False)
 
 

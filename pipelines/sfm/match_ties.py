@@ -19,6 +19,7 @@ from typing import Any, Self
 import numpy as np
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.formats.colmap import lens_of_colmap
 from pipelines.geometry.cameras import Camera, bearings, project_each
 from pipelines.geometry.similarity import Similarity, covariance_at, perturbation
 from pipelines.geometry.statistics import CAUCHY_95, NORMAL_MAD, cauchy_weight
@@ -95,10 +96,7 @@ class Tie:
 
 def side_of(model: Any, image: Sequence[int], row: Sequence[int]) -> Side:
     """Return matches (M,), features given by image and row, as parts of a `pycolmap.Reconstruction`."""
-    cameras = {
-        key: Camera(each.model_name, int(each.width), int(each.height), np.array(each.params, dtype=np.float64))
-        for key, each in model.cameras.items()
-    }
+    cameras = {key: lens_of_colmap(each) for key, each in model.cameras.items()}
     images = {key: model.images[key] for key in set(image)}
     pose = {key: each.cam_from_world().matrix() for key, each in images.items()}
     center = {key: each.projection_center() for key, each in images.items()}
@@ -171,11 +169,18 @@ def _chosen(model: Side, part: Side) -> BoolArray:
 def _judged(model: Side, part: Side, place: Similarity, *, has_scale: bool) -> Tie | str:
     worst_px = np.nanmax(np.abs(_equations(model, part, place)), axis=1)
     agree = worst_px < _GATE_PX
-    points, own = int((agree & model.is_point).sum()), int((agree & part.is_point).sum())
-    if agree.sum() < max(_FEWEST_MATCHES, _LEAST_SHARE * len(agree)) or points < _FEWEST_POINTS:
+    if agree.sum() < max(_FEWEST_MATCHES, _LEAST_SHARE * len(agree)):
         return f"{int(agree.sum())} of its {len(agree)} matches with the model agree with one place"
-    if has_scale and own < _FEWEST_POINTS:
-        return f"{own} of its points agree with one place, and {_FEWEST_POINTS} are needed"
+    # Rays along the base meet whatever the distance: points alone contradict a place shifted along it.
+    points, own = int((agree & model.is_point).sum()), int((agree & part.is_point).sum())
+    sides = ((points, model, "points of the model"), *(((own, part, "its own points"),) if has_scale else ()))
+    for count, side, which in sides:
+        known = int(side.is_point.sum())
+        if count < max(_FEWEST_POINTS, _LEAST_SHARE * known):
+            return (
+                f"{count} of the {known} {which} among its matches agree with one place, of which "
+                f"{100 * _LEAST_SHARE:.0f} % and {_FEWEST_POINTS} are needed"
+            )
     sigma = _sigma(model, part, place, has_scale=has_scale)
     if not sigma < _MOST_SIGMA:
         return f"its matches leave its place open by {100 * sigma:.0f} % of the distance to the ground"

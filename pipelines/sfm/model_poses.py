@@ -26,6 +26,8 @@ _MOST_ERROR_PX, _MOST_ERROR_OF_SIDE = 5.0, 0.01
 _USUAL_PX = 1.0  # median distance of matches from epipolar lines of right poses
 _CLEARLY = 0.25  # of the error as read, below which another convention explains it
 
+Matches = dict[tuple[int, int], tuple[FloatArray, FloatArray]]
+
 
 @dataclass(frozen=True)
 class Convention:
@@ -123,9 +125,7 @@ def check_observations(model: SparseModel, path: Path) -> None:
     raise _refusal(seen, errors, limit, path, "points reproject")
 
 
-def check_matches(
-    model: SparseModel, matches: dict[tuple[int, int], tuple[FloatArray, FloatArray]], path: Path
-) -> None:
+def check_matches(model: SparseModel, matches: Matches, path: Path) -> None:
     """Refuse poses that contradict matches of the photographs; names the convention that fits.
 
     `matches` has pixels (M, 2) and (M, 2) of pairs of images, given as rows of the model.
@@ -133,27 +133,37 @@ def check_matches(
     Raises:
         InputError: matches lie far from the epipolar lines in the median.
     """
-    rays = [
-        (i, j, undistort(model.camera_of(i), first), undistort(model.camera_of(j), second))
-        for (i, j), (first, second) in matches.items()
-    ]
-    focal = float(np.median(model.focal_px))
-
-    def error(convention: Convention) -> float:
-        rotation, translation = convention.poses(model.rotation_cam_from_local, model.translation_cam_from_local)
-        apart = [np.empty(0)]
-        for i, j, first, second in rays:
-            turn = rotation[j] @ rotation[i].T
-            apart.append(_sampson(turn, translation[j] - turn @ translation[i], first, second))
-        return focal * float(np.median(np.concatenate(apart))) if rays else 0.0
-
-    errors = {convention: error(convention) for convention in _conventions()}
+    rays = _rays(model, matches)
+    errors = {convention: _epipolar_px(model, rays, convention) for convention in _conventions()}
     as_read, limit = errors[Convention()], _limit_px(model.cameras)
     # Between views that are only shifted, other axes move matches little off their lines.
     if as_read <= limit and (as_read <= _USUAL_PX or min(errors.values()) > _CLEARLY * as_read):
         return
     seen = f"matches of the photographs lie {as_read:.0f} px (median) from the epipolar lines of its poses"
     raise _refusal(seen, errors, limit, path, "matches lie")
+
+
+def epipolar_error_px(model: SparseModel, matches: Matches) -> float:
+    """Return the median distance of matches from their epipolar lines in pixels; 0 without matches."""
+    return _epipolar_px(model, _rays(model, matches), Convention())
+
+
+def _rays(model: SparseModel, matches: Matches) -> list[tuple[int, int, FloatArray, FloatArray]]:
+    return [
+        (i, j, undistort(model.camera_of(i), first), undistort(model.camera_of(j), second))
+        for (i, j), (first, second) in matches.items()
+    ]
+
+
+def _epipolar_px(
+    model: SparseModel, rays: list[tuple[int, int, FloatArray, FloatArray]], convention: Convention
+) -> float:
+    rotation, translation = convention.poses(model.rotation_cam_from_local, model.translation_cam_from_local)
+    apart = [np.empty(0)]
+    for i, j, first, second in rays:
+        turn = rotation[j] @ rotation[i].T
+        apart.append(_sampson(turn, translation[j] - turn @ translation[i], first, second))
+    return float(np.median(model.focal_px)) * float(np.median(np.concatenate(apart))) if rays else 0.0
 
 
 def _refusal(seen: str, errors: dict[Convention, float], limit: float, path: Path, what: str) -> InputError:
@@ -168,9 +178,12 @@ def _refusal(seen: str, errors: dict[Convention, float], limit: float, path: Pat
         )
     return InputError(
         f"model-{best.code}",
-        f"Poses of the model are not COLMAP's: {seen}. They were written with {best.sentence}: read so, its {what} "
-        f"{errors[best]:.1f} px apart. Convert them and import the model again: {best.remedy}.",
+        (
+            f"Poses of the model are not COLMAP's: {seen}. They were written with {best.sentence}: read so, "
+            f"its {what} {errors[best]:.1f} px apart."
+        ),
         path=path,
+        remedy=f"Convert them and import the model again: {best.remedy}.",
     )
 
 

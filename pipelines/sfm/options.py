@@ -21,7 +21,21 @@ SolvedCamerasPath = Annotated[Path, InputMarker(_SOLVED, beside=_BESIDE)]
 
 
 class SfmOptions(StageOptions):
-    """Options of structure from motion with COLMAP."""
+    """Options of structure from motion with COLMAP.
+
+    Which images are matched follows from their positions and view directions. Features and matches of a large
+    survey are computed in chunks, as many at a time as cores and memory allow; a finished chunk is kept when the
+    command is interrupted. The result is a COLMAP model, sfm/sparse, which COLMAP itself opens; --import takes
+    the cameras that COLMAP, Metashape, PIX4Dmatic (OPF), OpenSfM, OpenDroneMap, nerfstudio or RealityScan has
+    solved.
+
+    Examples:
+      georef sfm flight
+      georef sfm flight --mapper global --max-image-size 1600
+      georef sfm flight --import colmap/sparse/0
+      georef sfm flight --import cameras.xml
+      georef sfm flight --cluster tls://scheduler:8786 --certificates certificates
+    """
 
     mapper: Literal["auto", "incremental", "global"] = Field(
         "auto", description="Mapper; auto: global for a large survey, incremental otherwise and where it fails."
@@ -63,6 +77,11 @@ class SfmOptions(StageOptions):
         description="Take the poses of the --import model alone, held fixed, and triangulate points from the "
         "photographs.",
     )
+    adjust_imported: Literal["auto", "yes", "no"] = Field(
+        "auto",
+        description="Adjust the imported cameras by the tie points; auto: where that lowers their χ² by more than "
+        "3 a parameter, but for COLMAP's models and with --triangulate.",
+    )
     chunk_size: Annotated[int, EFFORT] = Field(
         200,
         ge=4,
@@ -76,6 +95,8 @@ class SfmOptions(StageOptions):
     def _poses_to_triangulate(self) -> Self:
         if self.triangulate and self.import_model is None:
             raise ValueError("--triangulate takes the poses of --import, which is not given")
+        if self.adjust_imported != "auto" and self.import_model is None:
+            raise ValueError("--adjust-imported is for the cameras of --import, which is not given")
         return self
 
     def doubles(self, photo_px: tuple[int, int]) -> bool:

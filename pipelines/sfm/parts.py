@@ -24,14 +24,14 @@ _ATTITUDES_AGREE_DEG = 25.0  # median angle of attitudes and cameras
 
 
 @dataclass(frozen=True)
-class Part:
+class ModelPart:
     """A smaller model: its photographs that no larger one has, and the reason if it stays apart."""
 
     photographs: int
     apart: str  # empty: it was joined
 
 
-def join_parts(colmap: Any, models: list[Any], survey: Survey) -> tuple[Any, tuple[Part, ...]]:
+def join_parts(colmap: Any, models: list[Any], survey: Survey) -> tuple[Any, tuple[ModelPart, ...]]:
     """Return the largest of some `pycolmap.Reconstruction`s, to which the others were added, and what these are.
 
     The models are sorted, the largest first. COLMAP lets two of them share a few photographs: the first one keeps
@@ -39,27 +39,27 @@ def join_parts(colmap: Any, models: list[Any], survey: Survey) -> tuple[Any, tup
     """
     whole = models[0]
     measured = {image.name: image for image in survey.images}
-    anchor = _placed(whole, measured)
+    anchor = placed_by_positions(whole, measured)
     parts = []
     for model in models[1:]:
         new = len(set(model.reg_image_ids()) - set(whole.reg_image_ids()))
         if new == 0:
             continue
         if isinstance(anchor, str):
-            parts.append(Part(new, f"of the largest model, {anchor}"))
+            parts.append(ModelPart(new, f"of the largest model, {anchor}"))
             continue
-        place = _placed(model, measured)
+        place = placed_by_positions(model, measured)
         if isinstance(place, str):
-            parts.append(Part(new, place))
+            parts.append(ModelPart(new, place))
             continue
         moved = anchor.inverse() @ place
         model.transform(colmap.Sim3d(moved.matrix()[:3]))
         add_part(colmap, whole, model)
-        parts.append(Part(new, ""))
+        parts.append(ModelPart(new, ""))
     return whole, tuple(parts)
 
 
-def _placed(model: Any, measured: dict[str, SurveyImage]) -> Similarity | str:
+def placed_by_positions(model: Any, measured: dict[str, SurveyImage]) -> Similarity | str:
     """Return geo ← local of a model by its fixes and attitudes, or the reason why they do not place it."""
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     images = [image for image in images if image.name in measured and measured[image.name].fix is not None]

@@ -46,6 +46,11 @@ class Reconstructor(Protocol):
 
 
 def reconstructor_of(options: SfmOptions) -> Reconstructor:
+    """Return the engine that the options choose: COLMAP, or a model that is imported.
+
+    Raises:
+        InputError: the model to import cannot be read.
+    """
     if options.import_model is None:
         return ColmapReconstructor()
     return ImportedModel.of(options.import_model, triangulates=options.triangulate)

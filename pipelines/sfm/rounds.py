@@ -4,8 +4,10 @@
 2. Once more with the lens held, at that of a large sound model, else at what the photographs state: a model of few
    photographs, or of flat ground, finds a lens that fits it alone, and no other photograph fits that.
 3. Photographs and small models that stay out are joined by their matches with the largest one (`joining.py`).
-4. Learned features for the photographs that stay out, and the mapper again.
-5. Models that stay apart are placed beside the largest by their positions.
+4. Photographs that still stay out are matched where positions, attitudes and the model predict their features
+   (`predicted_matches.py`), and joined.
+5. Learned features for the photographs that stay out, and the mapper again.
+6. Models that stay apart are placed beside the largest by their positions; then step 4 again.
 """
 
 import logging
@@ -21,8 +23,9 @@ from pipelines.sfm.features import SfmJob, candidate_pairs
 from pipelines.sfm.joining import Join, join_by_matches
 from pipelines.sfm.learned_weights import missing_for_learned
 from pipelines.sfm.lens_check import lenses_astray
-from pipelines.sfm.mapping import MapperName, lens_of, map_database
-from pipelines.sfm.parts import Part, join_parts
+from pipelines.sfm.mapping import MapperName, map_database, replaced_lens
+from pipelines.sfm.parts import ModelPart, join_parts
+from pipelines.sfm.predicted_matches import add_predicted
 from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)
@@ -62,6 +65,7 @@ def map_in_rounds(colmap: Any, job: SfmJob, progress: Progress) -> MappedModels:
     best = MappedModels(*map_database(colmap, job, progress))
     best = _with_lens_held(colmap, job, best, progress)
     best, joins = _joined_by_matches(colmap, job, best, progress)
+    best, joins = _joined_by_prediction(colmap, job, best, joins, progress)
     if not _whole(best, job.survey) and job.options.features == "auto" and missing_for_learned() is None:
         pairs = _pairs_to_add(colmap, job, best)
         if len(pairs) and _add_learned(colmap, job, pairs, progress):
@@ -69,13 +73,13 @@ def map_in_rounds(colmap: Any, job: SfmJob, progress: Progress) -> MappedModels:
             again, joins_again = _joined_by_matches(colmap, job, again, progress)
             if _merit(again) > _merit(best):
                 best, joins = again, joins_again
-    _tell_of_ties(best, joins)
     if len(best.models) > 1 and best.registered < len(job.survey.images):
         _tell_of_parts(best, len(job.survey.images))
         alone = best.registered  # Joining adds photographs to this very model.
         largest, parts = join_parts(colmap, best.models, job.survey)
         _tell_of_joins(parts, alone)
-        best = replace(best, models=[largest])
+        best, joins = _joined_by_prediction(colmap, job, replace(best, models=[largest]), joins, progress)
+    _tell_of_ties(best, joins)
     return best
 
 
@@ -92,6 +96,20 @@ def _joined_by_matches(
     return replace(mapped, models=[largest, *mapped.models[1:]]), joins
 
 
+def _joined_by_prediction(
+    colmap: Any, job: SfmJob, mapped: MappedModels, joins: tuple[Join, ...], progress: Progress
+) -> tuple[MappedModels, tuple[Join, ...]]:
+    """Return the models and all joins, after matches were sought where the largest model predicts them."""
+    while mapped.models and mapped.mapper != "global" and mapped.registered < len(job.survey.images):
+        if not add_predicted(colmap, job, mapped.models[0], progress):
+            break
+        mapped, more = _joined_by_matches(colmap, job, mapped, progress)
+        joins += more
+        if not more:
+            break
+    return mapped, joins
+
+
 def _with_lens_held(colmap: Any, job: SfmJob, free: MappedModels, progress: Progress) -> MappedModels:
     """Return the better of the models and those with the lens held, where the first has a reason to doubt it."""
     if not free.models:
@@ -102,7 +120,7 @@ def _with_lens_held(colmap: Any, job: SfmJob, free: MappedModels, progress: Prog
     if astray:
         why = "; ".join(f"camera {camera} has {reason}" for camera, reason in astray.items())
         log.info("The model of %d photographs is solved again with the lens held: %s.", free.registered, why)
-    with lens_of(colmap, job.database, _sound_lens(free, job.survey)):
+    with replaced_lens(colmap, job.database, _sound_lens(free, job.survey)):
         models, mapper = map_database(colmap, job, progress, lens_held=True)
     held = MappedModels(models, mapper, lens_held=True)
     as_many = held.covered() >= free.covered() and held.registered >= free.registered
@@ -186,7 +204,7 @@ def _tell_of_parts(mapped: MappedModels, photographs: int) -> None:
     )  # fmt: skip
 
 
-def _tell_of_joins(parts: tuple[Part, ...], largest: int) -> None:
+def _tell_of_joins(parts: tuple[ModelPart, ...], largest: int) -> None:
     joined = [part.photographs for part in parts if not part.apart]
     if joined:
         log.warning(

@@ -19,7 +19,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.stages import COMMON_POINTS, RIG_MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import load_reconstruction, quiet_colmap
-from pipelines.sfm.dates import EarlierDate, tie_to_earlier
+from pipelines.sfm.dates import SolvedDate, tie_to_earlier
 from pipelines.sfm.features import SfmJob, masks_beside
 from pipelines.sfm.learned_weights import learned_remedy
 from pipelines.sfm.options import SfmOptions
@@ -44,7 +44,7 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
             raise InputError(
                 "earlier-is-itself", "is this workspace itself.", field="--earlier", path=options.earlier
             )
-        EarlierDate.load(options.earlier, survey)
+        SolvedDate.load(options.earlier, survey)
     continues = engine.prepare(stage, survey, options)
     arguments = {
         "survey": str(path),
@@ -86,7 +86,7 @@ def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, A
             message = "needs the features of the photographs, which an imported model with points has none of."
             raise InputError("earlier-needs-features", message, field="--earlier")
         with quiet_colmap() as colmap:
-            common = tie_to_earlier(colmap, job, model, EarlierDate.load(options.earlier, survey), progress)
+            common = tie_to_earlier(colmap, job, model, SolvedDate.load(options.earlier, survey), progress)
         common.save(job.sparse / Path(COMMON_POINTS).name)
         summary.values["common_points"] = len(common)
     if database.is_file():

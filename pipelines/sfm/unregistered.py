@@ -18,7 +18,7 @@ _MOST_LISTED = 10
 def unregistered(colmap: Any, database: Path, model: Any, remedy: str = "") -> tuple[Remark, ...]:
     """Return the warning that says for each photograph of a database why it is not in a model; none if all are.
 
-    `remedy` is a sentence that follows the reasons.
+    `remedy` is that of the warning.
     """
     inside = {image_id: model.images[image_id] for image_id in model.reg_image_ids()}
     with colmap.Database.open(database) as opened:
@@ -43,8 +43,8 @@ def unregistered(colmap: Any, database: Path, model: Any, remedy: str = "") -> t
     reasons = [f"{names[one]}: {_reason(matches[one], shared[one], names)}" for one in lost[:_MOST_LISTED]]
     more = f"; and {len(lost) - _MOST_LISTED} more" if len(lost) > _MOST_LISTED else ""
     many = "photographs are" if len(lost) > 1 else "photograph is"
-    sentence = f"{len(lost)} {many} not registered. {'; '.join(reasons)}{more}.{remedy}"
-    return (Remark(code="photographs-not-registered", sentence=sentence),)
+    sentence = f"{len(lost)} {many} not registered. {'; '.join(reasons)}{more}."
+    return (Remark(code="photographs-not-registered", sentence=sentence, remedy=remedy),)
 
 
 def _reason(matches: dict[int, int], shared: dict[int, int], names: dict[int, str]) -> str:

@@ -247,6 +247,10 @@ def _epochs(trajectory: TrueTrajectory, mounting: Mounting, step_ns: int) -> Int
 def record_imu(
     trajectory: TrueTrajectory, mounting: Mounting, sigma_deg: float, rng: np.random.Generator
 ) -> ImuLog:
+    """Return the attitudes of an IMU, with rates (rad/s) and specific force (m/s²), by the navigation clock.
+
+    `sigma_deg` is the white noise of an attitude around each axis.
+    """
     since_ns = _epochs(trajectory, mounting, IMU_STEP_NS)
     time_s = since_ns / 1e9
     true = trajectory.geo_from_body(time_s)

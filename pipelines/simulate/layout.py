@@ -209,6 +209,7 @@ class TownLayout:
 
 
 def make_town_layout(style: TownStyle, rng: np.random.Generator) -> TownLayout:
+    """Return where the town has houses, trees and cars, and its painted ground, drawn from the generator."""
     painter = GroundPainter()
     painter.box((-REACH_M, -REACH_M), (REACH_M, REACH_M), (0.11, 0.17, 0.05), GRASS)
     paint_meadows(painter, rng)

@@ -76,8 +76,9 @@ class BrownLens:
         if not solved or np.square(guess).sum(axis=1).max(initial=0.0) >= self._fold_radius() ** 2:
             raise InputError(
                 "distortion-too-strong",
-                "The distortion is too strong for this field of view. Use a smaller --k1 or a larger --focal.",
+                "The distortion is too strong for this field of view.",
                 field="--k1",
+                remedy="Use a smaller --k1 or a larger --focal.",
             )
         return np.concatenate([guess, np.ones((len(guess), 1))], axis=1)
 

@@ -115,6 +115,7 @@ def _receiver(options: SimulateOptions) -> flight.Receiver:
 
 
 def record(options: SimulateOptions, world: World, raycaster: Raycaster, seed: np.random.SeedSequence) -> Recording:
+    """Return what the flight records of the world: fixes, attitudes, photographs and marks, with errors."""
     gnss_seed, imu_seed, mark_seed = seed.spawn(3)
     receiver = _receiver(options)
     gnss = flight.record_gnss(world.trajectory, world.mounting, receiver, np.random.default_rng(gnss_seed))

@@ -218,6 +218,7 @@ def with_targets(
 
 
 def joined(first: Mesh, second: Mesh) -> Mesh:
+    """Return two meshes as one: the second follows the first, with its textures renumbered."""
     shifted = replace(second, texture=second.texture + np.int32(len(first.texture_params)))
     names = vars(first)
     return Mesh(**{name: np.concatenate([getattr(first, name), getattr(shifted, name)]) for name in names})

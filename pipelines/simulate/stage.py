@@ -130,7 +130,7 @@ def simulate(
         warnings=_warnings(options, well_seen, control),
     )
     for warning in summary.warnings:
-        log.warning("simulate: %s", warning.sentence)
+        log.warning("simulate: %s", warning.text)
     log.info("simulate: %s", summary.key_figure)
     return summary
 
@@ -174,12 +174,16 @@ def _check_folder(directory: Path, *, overwrite: bool) -> None:
         if not (directory / TRUTH).exists():
             raise InputError(
                 "folder-not-empty",
-                "The folder holds something other than a simulation. Choose another.",
+                "The folder holds something other than a simulation.",
                 path=directory,
+                remedy="Choose another.",
             )
         if not overwrite:
             raise InputError(
-                "simulation-exists", "The folder already holds a simulation. --force replaces it.", path=directory
+                "simulation-exists",
+                "The folder already holds a simulation.",
+                path=directory,
+                remedy="--force replaces it.",
             )
 
 
@@ -306,14 +310,11 @@ def _write_records(options: SimulateOptions, world: World, recording: Recording,
 def _warnings(options: SimulateOptions, well_seen: int, control: int) -> tuple[Remark, ...]:
     warnings = []
     if options.targets and well_seen < WANTED_CHECKS:
-        sentence = (
-            f"Only {well_seen} check points are seen in {WANTED_RAYS} photographs or more. Take more --images, "
-            "larger ones (--size), or more --targets."
-        )
-        warnings.append(Remark(code="few-check-points", sentence=sentence))
+        sentence = f"Only {well_seen} check points are seen in {WANTED_RAYS} photographs or more."
+        remedy = "Take more --images, larger ones (--size), or more --targets."
+        warnings.append(Remark(code="few-check-points", sentence=sentence, remedy=remedy))
     if control < options.control:
-        sentence = (
-            f"Only {control} of {options.control} control points are placed. Take more --targets or --images."
-        )
-        warnings.append(Remark(code="few-control-points", sentence=sentence))
+        sentence = f"Only {control} of {options.control} control points are placed."
+        remedy = "Take more --targets or --images."
+        warnings.append(Remark(code="few-control-points", sentence=sentence, remedy=remedy))
     return tuple(warnings)

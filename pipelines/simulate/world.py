@@ -204,6 +204,7 @@ def check_clearance(world: World, raycaster: Raycaster) -> None:
             where = "in the ground" if buried else f"{nearest:.1f} m from a surface"
             raise InputError(
                 "camera-too-near",
-                f"Photograph {i} would be taken {where}. Choose another --height or --radius.",
+                f"Photograph {i} would be taken {where}.",
                 field="--height",
+                remedy="Choose another --height or --radius.",
             )

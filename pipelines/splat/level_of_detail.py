@@ -73,6 +73,7 @@ def shadow_areas(sigmas: FloatArray) -> FloatArray:
 
 
 def mixture_of(splat: SplatArrays) -> Mixture:
+    """Return Gaussians as a mixture: mass (opacity times mean shadow), means (N, 3), covariances (N, 3, 3)."""
     sigmas = np.exp(np.clip(splat.log_scales.astype(np.float64), *_LOG_SCALES))
     opacities = 0.5 + 0.5 * np.tanh(0.5 * splat.logit_opacities.astype(np.float64))
     axes = matrix_from_quat_xyzw(np.roll(splat.quats_wxyz, -1, axis=1)) * sigmas[:, None]

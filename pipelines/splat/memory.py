@@ -6,8 +6,8 @@ import torch
 
 from pipelines.core.errors import ResourceError
 from pipelines.core.machine import free_main_memory_bytes
-from pipelines.geometry.bundle import predicted_basis_bytes
 from pipelines.geometry.cameras import Pinhole
+from pipelines.geometry.sparse_cholesky import predicted_factor_bytes
 from pipelines.splat.sh import coefficient_count
 
 _FLOAT = 4
@@ -40,7 +40,7 @@ def predicted_peak_bytes(size: TrainingSize) -> int:
     from pipelines.splat.rasterizer.cpu import predicted_bytes
 
     width = 11 + 3 * coefficient_count(size.sh_degree)
-    poses = predicted_basis_bytes(size.cameras)
+    poses = predicted_factor_bytes(size.cameras)
     images = size.camera.width * size.camera.height * _IMAGE_FLOATS * _FLOAT
     # Of the CPU rasteriser, for one visible Gaussian on six tiles; the GPU's needs less.
     raster = predicted_bytes(1000, Pinhole(1, 1, 1.0, 1.0, 0.5, 0.5), 0) // 1000
@@ -64,10 +64,10 @@ def require_memory(size: TrainingSize, free_bytes: int | None) -> None:
         advice = f"--max-gaussians {fitting} or a smaller --max-image-size"
     message = (
         f"Training needs about {_gib(needed)} of memory at its peak ({size.gaussians} Gaussians, images of "
-        f"{size.camera.width}×{size.camera.height} pixels); {_gib(free_bytes)} are free. Use {advice}, or close "
-        "other programs."
+        f"{size.camera.width}×{size.camera.height} pixels); {_gib(free_bytes)} are free."
     )
-    raise ResourceError("training-memory", message)
+    remedy = f"Use {advice}, or close other programs."
+    raise ResourceError("training-memory", message, remedy=remedy)
 
 
 def fitting_gaussians(size: TrainingSize, free_bytes: int) -> int:

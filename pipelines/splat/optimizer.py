@@ -112,8 +112,8 @@ class LearningRates:
         The rate limits the change of a Gaussian per step. At the rates of 3DGS, 600 iterations of a 48-image orbit
         (240 px, 20 000 Gaussians) leave holes between Gaussians that had no time to grow, and 18.1 dB on the test
         views. All rates raised 2, 4 and 8 times give 22.3, 26.8 and 23.7 dB. Sizes, places and direction-dependent
-        colours bear more than 4 times, and gain by it (docs/benchmarks.md, Rates); opacities, constant colours and
-        rotations gain nothing.
+        colours bear more than 4 times, and gain by it (examples/benchmarks/results/training.md, Rates); opacities,
+        constant colours and rotations gain nothing.
         """
         ratio = max(_REFERENCE_ITERATIONS / iterations, 1.0)
         return cls(

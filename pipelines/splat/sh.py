@@ -34,6 +34,7 @@ def coefficient_count(degree: int) -> int:
 
 
 def sh_from_rgb(rgb: Tensor) -> Tensor:
+    """Return the coefficients of degree 0 of colours from 0 to 1, of the same shape."""
     return (rgb - 0.5) / C0
 
 

@@ -73,7 +73,7 @@ class SpatialBlocks:
         self._radius = np.linalg.norm(places - self._center[:, None], axis=2).max(axis=1, initial=0.0)
         self._reach = reaches.max(axis=1, initial=0.0)
 
-    def shown(self, cam_from_model: FloatArray, camera: Pinhole, settings: RasterSettings) -> Gaussians:
+    def in_view(self, cam_from_model: FloatArray, camera: Pinhole, settings: RasterSettings) -> Gaussians:
         """Return few Gaussians, in their order: all that a render of the whole image, or of the settings' window,
         can show.
         """

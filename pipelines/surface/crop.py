@@ -9,8 +9,9 @@ from pipelines.core.workspace import Workspace
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.measured_area import area_of
 from pipelines.survey.area import Area
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.options import CropOptions
-from pipelines.survey.trained_survey import load_cameras
+from pipelines.survey.solution import read_sfm, read_solution
 
 
 @dataclass(frozen=True)
@@ -28,13 +29,13 @@ class Crop:
 
 
 def crop_of(workspace: Workspace, options: CropOptions) -> Crop | None:
-    """Return the crop that the options ask for; None: none. Errors as of `load_cameras` and `area_of`.
+    """Return the crop that the options ask for; None: none. Errors as of `read_solution` and `area_of`.
 
     The sky is what lies higher than all cameras.
     """
     if not options.crop and options.boundary is None:
         return None
-    solved = load_cameras(workspace)
-    cameras = solved.geo_from_model.apply(solved.poses.cam_center_in_model)
+    solution = read_solution(workspace)
+    sfm, survey, cameras = read_sfm(workspace, solution), load_survey(workspace), solution.center_in_geo
     sky_m = float(cameras[:, 2].max()) if options.keep_sky else np.inf
-    return Crop(area_of(options, solved, workspace), solved.geo_from_model, sky_m)
+    return Crop(area_of(options, workspace, solution, sfm, survey), solution.similarity, sky_m)

@@ -24,7 +24,7 @@ from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.surface.agreement import THRESHOLDS, agreed_depth, refine, surface_prior, without_rims
 from pipelines.surface.matching import UNSEEN, MatchSettings, StereoView
 from pipelines.surface.sweep import NormalMap, SweepPlanes, SweepResult, best_neighbours, plane_sweep, planes_for
-from pipelines.survey.photographs import ImageCache, save_array
+from pipelines.survey.photographs import ImageCache, mapped_array, save_array
 from pipelines.survey.scene import Scene
 
 # Layout of the cached arrays, a part of their key: files of another layout lie in another folder.
@@ -34,7 +34,7 @@ _KEY_DECIMALS = 6  # of metres and of direction cosines, in the key of the cache
 
 
 @dataclass(frozen=True)
-class Level:
+class PyramidLevel:
     """Pixels on which depths are looked for: first by a plane sweep, then by refinement of the level before."""
 
     name: str
@@ -45,9 +45,9 @@ class Level:
 
 # On middle pixels a wide window finds the surface where there is little texture. Where the surface is nearly known,
 # a small window does not extend it across the foot of a wall.
-MIDDLE = Level("middle", 320, MatchSettings(), steps=1.5)
-FINE = Level("fine", 640, MatchSettings(window_px=3, reach_px=2), steps=3.0)
-_LEVELS = (Level("coarse", 200, MatchSettings(window_px=3, reach_px=3)), MIDDLE, FINE)
+MIDDLE = PyramidLevel("middle", 320, MatchSettings(), steps=1.5)
+FINE = PyramidLevel("fine", 640, MatchSettings(window_px=3, reach_px=2), steps=3.0)
+_LEVELS = (PyramidLevel("coarse", 200, MatchSettings(window_px=3, reach_px=3)), MIDDLE, FINE)
 
 
 class DepthMaps:
@@ -107,16 +107,16 @@ class DepthMaps:
                 pool.shutdown(cancel_futures=True)
                 raise
 
-    def camera(self, index: int, level: Level = FINE) -> Pinhole:
+    def camera(self, index: int, level: PyramidLevel = FINE) -> Pinhole:
         """Return the camera of a level, or of a depth map."""
         return self.images.pinhole(index).limited(level.longest_px)
 
     def depth(self, index: int) -> Float32Array:
         """Return the depth (H, W) in metres along a training view's optical axis, mapped from disk; 0: unknown."""
-        array: Float32Array = np.load(self._path(index, "depth"), mmap_mode="r", allow_pickle=False)
+        array: Float32Array = mapped_array(self._path(index, "depth"))
         return array
 
-    def rgb(self, index: int, level: Level = FINE) -> ByteArray:
+    def rgb(self, index: int, level: PyramidLevel = FINE) -> ByteArray:
         """Return the photograph (H, W, 3) at the pixels of `camera`."""
         whole, pinhole = self.images.pinhole(index), self.camera(index, level)
         # All neighbours read a view: large photographs are shrunken once, by a factor that divides both sides.
@@ -133,7 +133,7 @@ class DepthMaps:
         reference, *views = (self._view(j, level) for j in (index, *others))
         return _packed(plane_sweep(reference, views, sweeps, level.settings))
 
-    def _refine(self, before: Level, level: Level, index: int) -> Float32Array:
+    def _refine(self, before: PyramidLevel, level: PyramidLevel, index: int) -> Float32Array:
         own = self._surface(index, before)
         if own is None:
             return _empty_maps(self.camera(index, level))
@@ -147,7 +147,7 @@ class DepthMaps:
             return np.zeros((self.camera(index).height, self.camera(index).width), dtype=np.float32)
         return self._agreed(own, index, FINE)
 
-    def _agreed(self, own: SweepResult, index: int, level: Level) -> Float32Array:
+    def _agreed(self, own: SweepResult, index: int, level: PyramidLevel) -> Float32Array:
         """Return the depths (H, W) on which views agree; 0 elsewhere."""
         others = [self._surface(j, level) for j in self._neighbours(index)]
         depth = agreed_depth(own, [other for other in others if other is not None])
@@ -155,11 +155,11 @@ class DepthMaps:
         window_px = MIDDLE.settings.window_px * own.camera.pinhole.width / self.camera(index, MIDDLE).width
         return without_rims(depth, int(window_px / 2))
 
-    def _surface(self, index: int, level: Level) -> SweepResult | None:
+    def _surface(self, index: int, level: PyramidLevel) -> SweepResult | None:
         sweeps = self._planes(index)
         if not sweeps:
             return None
-        normal_index, *rest = np.load(self._path(index, level.name), mmap_mode="r", allow_pickle=False)
+        normal_index, *rest = mapped_array(self._path(index, level.name))
         normals = NormalMap(np.stack([planes.normal_in_model for planes in sweeps]), normal_index.astype(np.uint8))
         return SweepResult(self._pose(index, level), normals, *rest)
 
@@ -172,11 +172,11 @@ class DepthMaps:
         pose, *around = (self._pose(j, _LEVELS[0]) for j in (index, *others))
         return planes_for(pose, around, points)
 
-    def _pose(self, index: int, level: Level) -> ViewPose:
+    def _pose(self, index: int, level: PyramidLevel) -> ViewPose:
         poses = self.scene.poses
         return ViewPose(self.camera(index, level), poses.cam_from_model[index], poses.cam_center_in_model[index])
 
-    def _view(self, index: int, level: Level) -> StereoView:
+    def _view(self, index: int, level: PyramidLevel) -> StereoView:
         grey = cv2.cvtColor(self.rgb(index, level), cv2.COLOR_RGB2GRAY).astype(np.float32) + 1
         mask = np.array(self.images.mask(index), dtype=np.uint8)
         grey[cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST) == 0] = 0

@@ -5,17 +5,19 @@ the plan, so that the candidates of one fit into the memory.
 """
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.machine import thread_count
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray, joined_rows
 from pipelines.geometry.footprints import voxel_keys
 from pipelines.geometry.similarity import Similarity
+from pipelines.surface.fusion_kernels import PixelLimits, chosen_pixels, voxel_means
 from pipelines.surface.surface_views import SurfaceView, SurfaceViews
 from pipelines.surface.visibility import Support
 
@@ -67,8 +69,8 @@ def pixel_on_surface_m(views: SurfaceViews, geo_from_model: Similarity) -> float
     if not medians:
         raise DegenerateGeometryError(
             "no-common-surface",
-            f"In none of the {len(views)} training views do rendered depths agree with those of other views. Train "
-            "with more --iterations, or with --dense.",
+            f"In none of the {len(views)} training views do rendered depths agree with those of other views.",
+            remedy="Train with more --iterations, or with --dense.",
         )
     return float(np.median(medians))
 
@@ -95,14 +97,12 @@ def fused_squares(
     """
     step = max(1, int(settings.spacing_m / pixel_on_surface_m(views, geo_from_model)))
     squares = _plan(views, geo_from_model, settings, step)
-    with progress.task("squares", len(squares)) as task:
+    with progress.task("squares", len(squares)) as task, ThreadPoolExecutor(thread_count()) as pool:
         for square, shown_by in squares:
-            found = (
-                _candidates(views.view(int(number)), geo_from_model, square, settings, step) for number in shown_by
-            )
-            parts = [part for part in found if part is not None]
-            if parts:
-                yield _fuse(joined_rows(parts), views, geo_from_model, square, settings)
+            in_square = partial(_candidates, views, geo_from_model, square, settings)
+            candidates = joined_rows(list(pool.map(in_square, [(int(number), step) for number in shown_by])))
+            if len(candidates.position):
+                yield _fuse(candidates, views, geo_from_model, square, settings)
             task.advance()
 
 
@@ -123,79 +123,37 @@ class _Square:
     corner_m: tuple[float, float]
     side_m: float
 
-    def covers(self, position: FloatArray, margin_m: float = 0.0) -> BoolArray:
-        """Return which points (…, 3) lie in the square widened by a margin, as (…)."""
-        offset = position[..., :2] - self.corner_m
-        return np.asarray(((offset >= -margin_m) & (offset < self.side_m + margin_m)).all(axis=-1))
+    def covers(self, position: FloatArray) -> BoolArray:
+        """Return which points (P, 3) lie in the square."""
+        offset = position[:, :2] - self.corner_m
+        return np.asarray(((offset >= 0) & (offset < self.side_m)).all(axis=1))
 
 
 def _candidates(
-    view: SurfaceView, geo_from_model: Similarity, square: _Square, settings: FusionSettings, step: int
-) -> _Candidates | None:
-    """Return the candidates of a view in a square and its margin, in every `step`-th row and column.
-
-    None: the view shows none of it.
-    """
-    margin_m = _MARGIN * settings.spacing_m
-    window = _window(view, geo_from_model, square, margin_m)
-    if window is None or view.rgb is None:
-        return None
-    rows, columns = window
-    depth = view.depth_m[rows, columns].astype(np.float64)
-    row, column = np.mgrid[window]
-    ray = view.pinhole.rays(np.stack([column, row], axis=-1) + 0.5)
-    point = geo_from_model.apply((depth[..., None] * ray) @ view.cam_from_model + view.cam_center_in_model)
-    normal, known = _normals(point, depth)
-    towards = geo_from_model.apply(view.cam_center_in_model) - point
-    # Without a surface, a pixel has the place of the camera.
-    distance = np.maximum(np.linalg.norm(towards, axis=-1), np.finfo(np.float64).tiny)
-    cosine = np.einsum("hwi,hwi->hw", normal, towards) / distance
-    pixel_m = geo_from_model.scale * depth / view.pinhole.fx
-    chosen = known & (np.abs(cosine) > GRAZING) & (pixel_m < settings.coarsest_m) & square.covers(point, margin_m)
-    chosen &= (row % step == step // 2) & (column % step == step // 2)
-    towards_camera = normal[chosen] * np.sign(cosine[chosen])[:, None]
-    return _Candidates(point[chosen], towards_camera, view.rgb[rows, columns][chosen], pixel_m[chosen])
-
-
-def _window(
-    view: SurfaceView, geo_from_model: Similarity, square: _Square, margin_m: float
-) -> tuple[slice, slice] | None:
-    """Return rows and columns of a view that show a square; parts narrower than `_LOOK_PX` may be missed."""
-    height, width = view.depth_m.shape
-    rows, columns = np.nonzero(view.depth_m[::_LOOK_PX, ::_LOOK_PX])
-    rows, columns = _LOOK_PX * rows, _LOOK_PX * columns
-    inside = square.covers(geo_from_model.apply(view.points(rows, columns)), margin_m)
-    if not inside.any():
-        return None
-    spare = _LOOK_PX + REACH_PX
-    top, left = max(int(rows[inside].min()) - spare, 0), max(int(columns[inside].min()) - spare, 0)
-    bottom = min(int(rows[inside].max()) + spare + 1, height)
-    right = min(int(columns[inside].max()) + spare + 1, width)
-    return slice(top, bottom), slice(left, right)
-
-
-def _normals(point: FloatArray, depth: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return unit normals (H, W, 3) with an arbitrary sign, and where they are known (H, W)."""
-    normal, known = np.zeros_like(point), np.zeros(depth.shape, dtype=np.bool_)
-    reach = REACH_PX
-    if min(depth.shape) <= 2 * reach:
-        return normal, known
-    middle = slice(reach, -reach)
-    before, after = slice(None, -2 * reach), slice(2 * reach, None)
-    right = point[middle, after] - point[middle, before]
-    down = point[after, middle] - point[before, middle]
-    cross = np.cross(right, down)
-    length = np.linalg.norm(cross, axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        own = depth[middle, middle]
-        # The inverse depth of a plane is linear on the image, at any angle of view.
-        bend = np.maximum(
-            np.abs(own / depth[middle, before] + own / depth[middle, after] - 2),
-            np.abs(own / depth[before, middle] + own / depth[after, middle] - 2),
+    views: SurfaceViews,
+    geo_from_model: Similarity,
+    square: _Square,
+    settings: FusionSettings,
+    which: tuple[int, int],
+) -> _Candidates:
+    """Return the candidates in a square and its margin of a view: its number, and of how many rows one is used."""
+    number, step = which
+    view = views.view(number)
+    assert view.rgb is not None
+    margin_m, pinhole = _MARGIN * settings.spacing_m, view.pinhole
+    low = np.array(square.corner_m) - margin_m
+    return _Candidates(
+        *chosen_pixels(
+            view.depth_m,
+            view.rgb,
+            np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy]),
+            geo_from_model.scale * geo_from_model.rotation @ view.cam_from_model.T,
+            geo_from_model.apply(view.cam_center_in_model),
+            geo_from_model.scale,
+            np.concatenate([low, low + square.side_m + 2 * margin_m]),
+            PixelLimits(REACH_PX, BEND, GRAZING, settings.coarsest_m, step, _LOOK_PX),
         )
-        normal[middle, middle] = cross / length[..., None]
-    known[middle, middle] = (own > 0) & (length > 0) & (bend < BEND)
-    return normal, known
+    )
 
 
 def _plan(
@@ -218,8 +176,9 @@ def _plan(
     candidates = counts * (look / step) ** 2  # estimated from every `look`-th pixel
     level = int(np.ptp(cells, axis=0).max()).bit_length()
     while True:
-        squares, member = np.unique(cells >> level, axis=0, return_inverse=True)
-        if level == 0 or np.bincount(member.ravel(), candidates).max() <= _MOST_CANDIDATES:
+        keys = voxel_keys(cells.astype(np.float64), 2.0**level)
+        _, first, member = np.unique(keys, return_index=True, return_inverse=True)
+        if level == 0 or np.bincount(member, candidates).max() <= _MOST_CANDIDATES:
             break
         level -= 1
     side_m = float(unit_m * 2**level)
@@ -230,7 +189,7 @@ def _plan(
             _Square((float(place[0] * side_m), float(place[1] * side_m)), side_m),
             np.unique(owner[((low <= place) & (place <= high)).all(axis=1)]),
         )
-        for place in squares
+        for place in cells[first] >> level
     ]
 
 
@@ -242,8 +201,10 @@ def _cells(
     rows, columns = look * rows + look // 2, look * columns + look // 2
     fine = geo_from_model.scale * view.depth_m[rows, columns] / view.pinhole.fx < coarsest_m
     position: FloatArray = geo_from_model.apply(view.points(rows[fine], columns[fine]))
-    cell, count = np.unique(np.floor(position[:, :2] / unit_m).astype(np.int64), axis=0, return_counts=True)
-    return cell, count
+    if not len(position):
+        return np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
+    _, first, count = np.unique(voxel_keys(position[:, :2], unit_m), return_index=True, return_counts=True)
+    return np.floor(position[first, :2] / unit_m).astype(np.int64), count
 
 
 def _fuse(
@@ -254,7 +215,7 @@ def _fuse(
     settings: FusionSettings,
 ) -> SurfaceCloud:
     side_m = settings.spacing_m
-    position, normal, rgb, pixel_m = _voxel_means(side_m, candidates.position, *vars(candidates).values())
+    position, normal, rgb, pixel_m = voxel_means(side_m, candidates.position, *vars(candidates).values())
     normal = _unit(normal)
     support = views.support(geo_from_model.inverse().apply(position), normal @ geo_from_model.rotation)
     sigma_m = surface_sigma(support, pixel_m)
@@ -263,7 +224,7 @@ def _fuse(
         good = (support.views >= settings.min_views) & (support.seen_through <= MOST_THROUGH * support.views)
         good &= (sigma_m < _RESOLVED * pixel_m) & square.covers(moved)
     rows = np.flatnonzero(good)
-    position, normal, rgb, variance = _voxel_means(
+    position, normal, rgb, variance = voxel_means(
         side_m, moved[rows], moved[rows], normal[rows], rgb[rows], sigma_m[rows] ** 2
     )
     return SurfaceCloud(position, _unit(normal), np.round(rgb).astype(np.uint8), np.sqrt(variance))
@@ -287,17 +248,3 @@ def _unit(vectors: FloatArray) -> FloatArray:
     """Return vectors (P, 3) of length one; NaN for a zero vector."""
     with np.errstate(invalid="ignore"):
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
-
-
-def _voxel_means(side_m: float, position: FloatArray, *values: NDArray[Any]) -> list[FloatArray]:
-    """Return the means of values (P, …) over the voxels that hold points (P, 3): (V, …) each."""
-    if not len(position):
-        return [np.zeros(value.shape) for value in values]
-    key = voxel_keys(position, side_m)
-    order = np.argsort(key, kind="stable")
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))
-    count = np.diff(first, append=len(key))
-    return [
-        np.add.reduceat(value[order].astype(np.float64), first) / count.reshape(-1, *(1,) * (value.ndim - 1))
-        for value in values
-    ]

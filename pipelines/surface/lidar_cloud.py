@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import ByteArray, FloatArray, IntArray, Rows
+from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray, Rows, joined_rows
 from pipelines.formats.trajectory_csv import read_trajectory
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
@@ -71,6 +71,7 @@ class ScannerTrack:
 
 
 _NEIGHBOURS = 12
+_SQUARE_VOXELS = 20.0  # side of the squares that are held out, which hold whole neighbourhoods
 _MOST_POINTS = 3_000_000
 _MARGIN = 0.1  # of the scene's size, around its points
 _SCENE_SHARE = 0.01  # of the SfM points on each side may lie outside the scene
@@ -111,8 +112,12 @@ def read_cloud(
     *,
     progress: Progress = SILENT,
     track: ScannerTrack | None = None,
-) -> LidarCloud:
+    held_out: float = 0.0,
+) -> tuple[LidarCloud, LidarCloud | None]:
     """Return the points of the clouds in the scene, as dense as pixels of `pixel_m` on the surface resolve it.
+
+    The second cloud has the points of the squares that are `held_out`, a share of all squares; None: there are too
+    few to tell their planes, and the first cloud has all points. No plane counts points of the other cloud.
 
     Raises:
         InputError: as `read_thinned` and `ScannerTrack.at`, or too few points in the scene.
@@ -132,10 +137,32 @@ def read_cloud(
     model_from_geo = scene.geo_from_model.inverse()
     places = _stations_of(files, cloud) if track is None else track.at(cloud.gps_time_s)
     scanner = None if places is None else model_from_geo.apply(places)
-    planes = planes_of(
-        model_from_geo.apply(cloud.position_in_geo), cloud.classification, cloud.voxel_m, cloud.weight
-    )
-    return replace(planes, scanner_in_model=scanner)
+    held = in_held_out_squares(cloud.position_in_geo, _SQUARE_VOXELS * cloud.voxel_m, held_out)
+    if held.sum() <= _NEIGHBOURS or (~held).sum() <= 10 * _NEIGHBOURS:
+        held[:] = False
+
+    def part(rows: BoolArray) -> LidarCloud:
+        place = model_from_geo.apply(cloud.position_in_geo[rows])
+        planes = planes_of(place, cloud.classification[rows], cloud.voxel_m, cloud.weight[rows])
+        return replace(planes, scanner_in_model=None if scanner is None else scanner[rows])
+
+    return part(~held), part(held) if held.any() else None
+
+
+def in_held_out_squares(position: FloatArray, side_m: float, share: float) -> BoolArray:
+    """Return which points (P, 3) lie in the squares of the plan that are held out: the same in every run.
+
+    A hash of the square's place decides, so that neither the order of the points nor their number counts.
+    """
+    east, north = np.floor(position[:, :2] / side_m).astype(np.int64).astype(np.uint64).T
+    mixed = east * np.uint64(0x9E3779B97F4A7C15) ^ north * np.uint64(0xC2B2AE3D27D4EB4F)
+    mixed = (mixed ^ mixed >> np.uint64(29)) * np.uint64(0xBF58476D1CE4E5B9)
+    return np.asarray((mixed ^ mixed >> np.uint64(32)) / 2.0**64 < share)
+
+
+def joined_clouds(first: LidarCloud, second: LidarCloud) -> LidarCloud:
+    """Return the points of both clouds, without the places of their scanners."""
+    return joined_rows([replace(cloud, scanner_in_model=None) for cloud in (first, second)])
 
 
 def _stations_of(files: MeasuredFiles, cloud: MeasuredCloud) -> FloatArray | None:

@@ -139,8 +139,9 @@ class TiledPoints:
         if shutil.disk_usage(self._folder).free < rows.nbytes + _SPARE_BYTES:
             raise InputError(
                 "disk-full",
-                "No room for the points that are compared. Make room on this disk.",
+                "No room for the points that are compared.",
                 path=self._folder,
+                remedy="Make room on this disk.",
             )
         rows["position"] = position
         if normal is not None:

@@ -18,15 +18,15 @@ from pipelines.core.stages import GAUSSIANS, MODEL
 from pipelines.core.types import Float32Array, FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Pinhole, ViewPose
-from pipelines.splat.rasterizer.backends import rasterizer
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.surface import measured_depth
-from pipelines.surface.surface_views import SAME_SURFACE, ModelRenderer, photo_consistent
+from pipelines.surface.surface_views import SAME_SURFACE, ModelRenderer, model_renderer, photo_consistent
 from pipelines.surface.visibility import DepthViews, Viewpoints, support
 from pipelines.survey.area import Area, boundary_area, depths_of_observations, scene_in_geo, seen_area
 from pipelines.survey.measured_ground import MeasuredGround
 from pipelines.survey.options import LEAST_PHOTOGRAPHS, FilledAreaOptions
-from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey, load_trained
+from pipelines.survey.solution import Solution, TrainedModel, read_trained
+from pipelines.survey.survey import Survey
 
 _LONGEST_PX = 320  # of the depth maps
 _MOST_PIXELS = 1 << 27  # of all depth maps: half a gibibyte
@@ -45,7 +45,13 @@ log = logging.getLogger(__name__)
 
 
 def area_of(
-    options: FilledAreaOptions, solved: SolvedSurvey, workspace: Workspace, progress: Progress = SILENT
+    options: FilledAreaOptions,
+    workspace: Workspace,
+    solution: Solution,
+    sfm: SparseModel,
+    survey: Survey,
+    *,
+    progress: Progress = SILENT,
 ) -> Area:
     """Return the area of interest, at which every product ends.
 
@@ -58,12 +64,12 @@ def area_of(
         InputError: the boundary cannot be read, states no CRS, or lies elsewhere; or a photograph cannot be read.
         DegenerateGeometryError: no ground is seen by enough photographs.
     """
-    scene = scene_in_geo(solved)
-    stated = boundary_area(options, scene, solved.survey.origin)
-    whole = seen_area(solved, scene) if stated is None else stated
+    scene = scene_in_geo(solution, sfm)
+    stated = boundary_area(options, scene, survey.origin)
+    whole = seen_area(solution, sfm, scene) if stated is None else stated
     if not workspace.has(MODEL):
         return whole
-    ground = measured_ground(solved, workspace, progress)
+    ground = measured_ground(workspace, solution, sfm, survey, progress)
     fill = "all" if options.fill is None and stated is not None else options.fill
     if fill != "all":
         outline = ground.outline(whole.polygon, fill)
@@ -81,22 +87,22 @@ def area_of(
     return replace(whole, measured=ground.share(whole.polygon))
 
 
-def measured_ground(solved: SolvedSurvey, workspace: Workspace, progress: Progress = SILENT) -> MeasuredGround:
+def measured_ground(
+    workspace: Workspace, solution: Solution, sfm: SparseModel, survey: Survey, progress: Progress = SILENT
+) -> MeasuredGround:
     """Return the ground that the training views of the trained model measure, from the cache if it is there.
 
     Raises:
         InputError: a photograph or a product cannot be read.
     """
-    path = workspace.cache / "area" / f"{_key(solved, workspace)}.npz"
+    path = workspace.cache / "area" / f"{_key(solution, workspace)}.npz"
     if path.exists():
         try:
             return MeasuredGround.load(path)
         except InputError as error:
             log.warning("%s; it is made again", error)
-    trained = solved if isinstance(solved, TrainedSurvey) else load_trained(workspace)
-    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-    renderer = ModelRenderer(trained, images, rasterizer("auto", progress, mip_filter=trained.model.mip_filter))
-    found = measured_by(renderer, progress)
+    model = solution if isinstance(solution, TrainedModel) else read_trained(workspace)
+    found = measured_by(model_renderer(workspace, model, sfm, survey, progress=progress), progress)
     try:
         found.save(path)
     except OSError as error:  # found again next time
@@ -104,10 +110,10 @@ def measured_ground(solved: SolvedSurvey, workspace: Workspace, progress: Progre
     return found
 
 
-def _key(solved: SolvedSurvey, workspace: Workspace) -> str:
+def _key(solution: Solution, workspace: Workspace) -> str:
     """Return a hash of all that decides what is measured."""
     digest = hashlib.sha256(_LAYOUT)
-    digest.update(repr(solved.geo_from_model).encode())
+    digest.update(repr(solution.similarity).encode())
     for product in (MODEL, GAUSSIANS):
         with workspace.path(product).open("rb") as handle:
             digest.update(hashlib.file_digest(handle, "sha256").digest())
@@ -121,9 +127,8 @@ def measured_by(renderer: ModelRenderer, progress: Progress = SILENT) -> Measure
     2. A cell of the plan has the median height of the views that show it.
     3. It is measured if three views agree on that height, more than look through it, to a training pixel.
     """
-    trained = renderer.trained
-    cameras = trained.indices("train")
-    depth_m, focal_px = depths_of_observations(trained)
+    cameras = renderer.model.indices("train")
+    depth_m, focal_px = depths_of_observations(renderer.model, renderer.sfm)
     photo_m = float(np.median(depth_m / focal_px)) if len(depth_m) else 1.0
     longest_px = min(_LONGEST_PX, int((_MOST_PIXELS / max(len(cameras), 1)) ** 0.5))
     pinholes = tuple(renderer.pinholes.of(index).limited(longest_px) for index in cameras)
@@ -132,7 +137,7 @@ def measured_by(renderer: ModelRenderer, progress: Progress = SILENT) -> Measure
         for index, pinhole in zip(cameras, pinholes, strict=True):
             maps.append(_depth(renderer, index, pinhole))
             task.advance()
-    poses, geo_from_model = trained.poses, trained.geo_from_model
+    poses, geo_from_model = renderer.poses, renderer.geo_from_model
     rotation, center = poses.cam_from_model[cameras], poses.cam_center_in_model[cameras]
     widths = [
         geo_from_model.scale * float(np.median(depth[depth > 0])) / pinhole.fx

@@ -154,7 +154,8 @@ class CloudReader:
             Remark(
                 code=f"{stated.flag.removeprefix('--')}-heights",
                 sentence=f"The heights of the cloud were taken as ellipsoidal, in {unit}: {name} has no vertical "
-                f"part ({stated.flag}-vertical states one).",
+                "part.",
+                remedy=f"{stated.flag}-vertical states one.",
             )
             for name, unit in sorted(silent)
         )
@@ -310,11 +311,13 @@ def _explained(placed: PlacedCrs) -> Iterator[None]:
         if not placed.remarks:
             raise
         message = error.message + _said(placed.remarks)
-        raise InputError(error.code, message, path=error.path, line=error.line, field=error.field) from error
+        raise InputError(
+            error.code, message, path=error.path, line=error.line, field=error.field, remedy=error.remedy
+        ) from error
 
 
 def _said(remarks: Sequence[Remark]) -> str:
-    return "".join(f" {remark.sentence}" for remark in remarks)
+    return "".join(f" {remark.text}" for remark in remarks)
 
 
 def _by_code(remarks: Sequence[Remark]) -> list[list[Remark]]:
@@ -328,7 +331,7 @@ def _few(remarks: Sequence[Remark]) -> tuple[Remark, ...]:
     """Return the remarks of one code on many files as one, which counts the others."""
     first = remarks[0]
     more = "" if len(remarks) == 1 else f" {len(remarks) - 1} more of the files are so."
-    return (Remark(code=first.code, sentence=first.sentence + more),)
+    return (first.model_copy(update={"sentence": first.sentence + more}),)
 
 
 def suffixes_in(path: Path) -> set[str]:
@@ -386,7 +389,8 @@ def _placed_mesh(mesh: TriangleMesh, stated: CloudCrs) -> MeshFile:
     if not mesh.states_axes:
         sentence = (
             f"{mesh.path.name}: its axes were taken as easting, northing and height, in this order: an OBJ does "
-            f"not say which axis is up. {stated.flag}-up states it."
+            f"not say which axis is up."
         )
-        remarks.append(Remark(code=f"{stated.flag.removeprefix('--')}-axes", sentence=sentence))
+        code, remedy = f"{stated.flag.removeprefix('--')}-axes", f"{stated.flag}-up states it."
+        remarks.append(Remark(code=code, sentence=sentence, remedy=remedy))
     return MeshFile(replace(mesh, vertices=place.position), place.crs, tuple(remarks))

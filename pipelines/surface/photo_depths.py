@@ -166,16 +166,16 @@ class PhotoDepths:
         )
         if self.stated.along is not None:
             if clear and better != self.stated.along:
-                message = (
-                    f"The depths do not count along the {self.stated.along}: {what}. Give --depth-along {better}."
-                )
-                raise InputError("depth-along-differs", message, field="--depth-along")
+                message = f"The depths do not count along the {self.stated.along}: {what}."
+                remedy = f"Give --depth-along {better}."
+                raise InputError("depth-along-differs", message, field="--depth-along", remedy=remedy)
             return
         self.along = better if clear else "axis"
         name = "optical axis" if self.along == "axis" else "ray"
         reason = what if clear else f"{what}, which does not decide"
-        sentence = f"The depths were taken along the {name}: {reason}. --depth-along states it."
-        self._remarks.append(Remark(code="depth-along-assumed", sentence=sentence))
+        sentence = f"The depths were taken along the {name}: {reason}."
+        remedy = "--depth-along states it."
+        self._remarks.append(Remark(code="depth-along-assumed", sentence=sentence, remedy=remedy))
 
     def _check_unit(self, middle: float, count: int) -> None:
         if abs(middle - 1.0) <= _OFF_UNIT:
@@ -183,10 +183,10 @@ class PhotoDepths:
         fits = self.stated.unit_m * middle
         message = (
             f"Depths of stereo are {middle:.4g} times those of the maps (median of {count} pixels): a value is "
-            f"about {fits:.4g} m, and --depth-unit states {self.stated.unit_m:.6g} m. Check the unit, "
-            "--depth-camera, and the scale of the georeference."
+            f"about {fits:.4g} m, and --depth-unit states {self.stated.unit_m:.6g} m."
         )
-        raise InputError("depth-unit-differs", message, field="--depth-unit")
+        remedy = "Check the unit, --depth-camera, and the scale of the georeference."
+        raise InputError("depth-unit-differs", message, field="--depth-unit", remedy=remedy)
 
     def chunks(
         self, origin: Origin, progress: Progress = SILENT, thinning: Thinning | None = None
@@ -215,11 +215,14 @@ class PhotoDepths:
             scale = np.array([camera.width / width, camera.height / height])
             if abs(scale[0] / scale[1] - 1) > _MOST_ASPECT:
                 message = (
-                    f"The map of {width}×{height} pixels has not the shape of its photograph, "
-                    f"{camera.width}×{camera.height}: it is cut, turned or of another camera. State its camera "
-                    "with --depth-camera fx,fy,cx,cy, or write maps that show what the photographs show."
+                    f"The map of {width}×{height} pixels has not the shape of its photograph, {camera.width}"
+                    f"×{camera.height}: it is cut, turned or of another camera."
                 )
-                raise InputError("depth-size", message, path=path, field="--depth-camera")
+                remedy = (
+                    "State its camera with --depth-camera fx,fy,cx,cy, or write maps that show what the "
+                    "photographs show."
+                )
+                raise InputError("depth-size", message, path=path, field="--depth-camera", remedy=remedy)
         if image.is_half or image.step * self.stated.unit_m / np.sqrt(12) > self.stated.sigma_m:
             self._note_step(path, image.is_half)
         value = without_steps(image.value)
@@ -248,8 +251,9 @@ class PhotoDepths:
         if any(remark.code == "depth-resolution" for remark in self._remarks):
             return
         what = "floats of 16 bits, with three decimal digits" if is_half else "integers of a coarse unit"
-        sentence = f"{path.name}: the depths are {what}: their rounding may exceed the stated σ of --lidar-sigma."
-        self._remarks.append(Remark(code="depth-resolution", sentence=sentence))
+        sentence = f"{path.name}: the depths are {what}: their rounding may exceed their stated σ."
+        remedy = "--lidar-sigma states it."
+        self._remarks.append(Remark(code="depth-resolution", sentence=sentence, remedy=remedy))
 
 
 def without_steps(value: Float32Array) -> Float32Array:

@@ -14,13 +14,12 @@ from pipelines.surface.surface_views import ModelRenderer
 
 def through_lens(renderer: ModelRenderer, index: int, colour: Tensor) -> Tensor:
     """Return colours (H, W, 3) of a render as the lens and the exposure of its photograph show them."""
-    trained = renderer.trained
-    camera_id, pinhole = int(trained.sparse.image_camera_id[index]), renderer.pinholes.of(index)
-    lens = next((lens for lens in trained.model.vignetting if lens.camera_id == camera_id), None)
+    camera_id, pinhole = int(renderer.sparse.image_camera_id[index]), renderer.pinholes.of(index)
+    lens = next((lens for lens in renderer.model.vignetting if lens.camera_id == camera_id), None)
     if lens is not None:
         radius2 = squared_radius(pinhole, pinhole, colour.device)
         colour = with_vignetting(colour, radius2, torch.tensor(lens.coefficients, device=colour.device))
-    exposure = trained.model.cameras[index].exposure
+    exposure = renderer.model.cameras[index].exposure
     return colour if exposure is None else with_affine(colour, torch.tensor(exposure, device=colour.device))
 
 

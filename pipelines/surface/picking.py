@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geometry.cameras import Pinhole, ViewPose
+from pipelines.geometry.cameras import CameraPoses, Pinhole, ViewPose
 from pipelines.geometry.rotations import rotation_towards
 from pipelines.geometry.statistics import spatial_median
 from pipelines.splat.rasterizer.api import Window
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import MarkRays
-from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.survey.solution import Solution
 
 REACH_PX = 1  # around the pixel of a mark
 LEAST_VIEWS = 2  # that must show a point
@@ -93,29 +93,29 @@ def depth_around(renderer: ModelRenderer, camera: int, xy: FloatArray, reach_px:
     return DepthMap(pinhole, renderer.depth_m(pose, Window(left, top, width, height)), left, top)
 
 
-def points_on_surface(trained: TrainedSurvey, rays: MarkRays, maps: Sequence[DepthMap]) -> FloatArray:
+def points_on_surface(solution: Solution, rays: MarkRays, maps: Sequence[DepthMap]) -> FloatArray:
     """Return the points (J, 3) in `geo` at which the model's surface lies behind their marks, by K maps.
 
     Each map is the depth around a mark in its view. The result is the spatial median of the views that count; NaN
     for a point with fewer than two.
     """
-    middle = np.full((len(rays.point_name), 3), np.nan)
+    poses, middle = solution.poses, np.full((len(rays.point_name), 3), np.nan)
     for point in range(len(middle)):
-        _, place = _counted_hits(trained, rays, maps, np.flatnonzero(rays.point == point))
+        _, place = _counted_hits(poses, rays, maps, np.flatnonzero(rays.point == point))
         if len(place) >= LEAST_VIEWS:
             middle[point] = spatial_median(place)
-    return trained.geo_from_model.apply(middle)
+    return solution.similarity.apply(middle)
 
 
 def _counted_hits(
-    trained: TrainedSurvey, rays: MarkRays, maps: Sequence[DepthMap], rows: IntArray
+    poses: CameraPoses, rays: MarkRays, maps: Sequence[DepthMap], rows: IntArray
 ) -> tuple[IntArray, FloatArray]:
     """Return the marks of one point that count, and where (V, 3) in `model` their rays meet the views' own surface.
 
     Rays on unbroken surface count, if two or more are: beside an edge of the surface, a fraction of a pixel decides
     between roof and ground.
     """
-    poses, slopes = trained.poses, rays.xy[rows]
+    slopes = rays.xy[rows]
     position, at_edge = np.full((len(rows), 3), np.nan), np.zeros(len(rows), dtype=bool)
     for index, (camera, xy) in enumerate(zip(rays.camera[rows], slopes, strict=True)):
         view = maps[rows[index]]
@@ -173,8 +173,7 @@ class SurfaceReader:
     """Reader of the surface of a trained model."""
 
     def __init__(self, renderer: ModelRenderer) -> None:
-        self.renderer, self._trained = renderer, renderer.trained
-        self._train = renderer.trained.indices("train")
+        self.renderer, self._train = renderer, renderer.model.indices("train")
 
     def focal_px(self, camera: int) -> float:
         """Return the focal length of a camera's depth map."""
@@ -209,7 +208,7 @@ class SurfaceReader:
                 (at_edge if broken else unbroken).append((distance, camera))
         point = self._agreed(sight, unbroken if len(unbroken) >= LEAST_VIEWS else unbroken + at_edge)
         if isinstance(point, SurfacePoint):
-            place = self._trained.geo_from_model.inverse().apply(point.position_in_geo[None])[0]
+            place = self.renderer.geo_from_model.inverse().apply(point.position_in_geo[None])[0]
             through = sum(self._looks_through(view, camera, place) for camera, view in views.items())
             if through > MOST_THROUGH * len(point.cameras):
                 return NoSurface(f"{through} photographs look through this place, {len(point.cameras)} show it")
@@ -223,11 +222,11 @@ class SurfaceReader:
         maps = [
             depth_around(self.renderer, int(camera), xy) for camera, xy in zip(rays.camera, rays.xy, strict=True)
         ]
-        counted, place = _counted_hits(self._trained, rays, maps, np.arange(len(rays.point)))
+        counted, place = _counted_hits(self.renderer.poses, rays, maps, np.arange(len(rays.point)))
         if len(place) < LEAST_VIEWS:
             return NoSurface("fewer than two photographs show a surface behind the marks")
         middle = spatial_median(place)
-        geo_from_model = self._trained.geo_from_model
+        geo_from_model = self.renderer.geo_from_model
         apart = (place - middle) @ geo_from_model.rotation.T * geo_from_model.scale
         distance = np.linalg.norm(apart, axis=1)
         near = apart[distance <= 3 * np.median(distance)]  # the median leaves the others out, too
@@ -253,7 +252,7 @@ class SurfaceReader:
         return [camera for _, camera in sorted(detail)[:MOST_VIEWS]]
 
     def _in_cam(self, camera: int, place: FloatArray) -> FloatArray:
-        poses = self._trained.poses
+        poses = self.renderer.poses
         return np.asarray(poses.cam_from_model[camera] @ (place - poses.cam_center_in_model[camera]))
 
     def _slope(self, camera: int, place: FloatArray) -> FloatArray:
@@ -296,7 +295,7 @@ class SurfaceReader:
         if len(distance) < LEAST_VIEWS:
             return NoSurface("fewer than two photographs agree on the surface here")
         middle = float(np.median(distance))
-        geo_from_model = self._trained.geo_from_model
+        geo_from_model = self.renderer.geo_from_model
         variance = float(np.mean((distance - middle) ** 2)) + self._variance_of_rays(sight.at(middle), cameras)
         axis = geo_from_model.rotation @ sight.direction_in_model * geo_from_model.scale
         return SurfacePoint(
@@ -304,7 +303,7 @@ class SurfaceReader:
         )
 
     def _variance_of_rays(self, place: FloatArray, cameras: IntArray) -> float:
-        arm = place - self._trained.poses.cam_center_in_model[cameras]
+        arm = place - self.renderer.poses.cam_center_in_model[cameras]
         return variance_of_rays(arm, np.array([self.renderer.pinholes.of(int(camera)).fx for camera in cameras]))
 
 

@@ -68,12 +68,11 @@ def heights_in_plan(
         most_views: that read a place: the most detailed ones.
         advance: called with the share that is done; an exception of it ends the work.
     """
-    trained = renderer.trained
     extent_m = float(np.ptp(plan, axis=0).max())
     levels = level_m + np.array([0.0, -1.0, 1.0]) * max(_RELIEF_M, _RELIEF * extent_m)
     reads = _readers(renderer, np.column_stack([plan, np.full(len(plan), level_m)]), most_views)
     by_use = [int(camera) for camera in np.argsort(-reads.sum(axis=0), kind="stable") if reads[:, camera].any()]
-    tree, count = cKDTree(plan), len(trained.sparse.image_name)
+    tree, count = cKDTree(plan), len(renderer.sparse.image_name)
     height = np.full((len(plan), count), np.nan)
     for number, camera in enumerate(by_use):
         points = _seen_points(renderer, camera, plan[reads[:, camera]], levels, reach_m)
@@ -91,12 +90,11 @@ def heights_in_plan(
 
 def _readers(renderer: ModelRenderer, points: FloatArray, most_views: int) -> BoolArray:
     """Return which cameras (N, C) read points (N, 3) in `geo`: the most detailed training views that hold them."""
-    trained = renderer.trained
-    in_model = trained.geo_from_model.inverse().apply(points)
-    detail = np.full((len(points), len(trained.sparse.image_name)), np.inf)
-    for camera in trained.indices("train"):
+    in_model = renderer.geo_from_model.inverse().apply(points)
+    detail = np.full((len(points), len(renderer.sparse.image_name)), np.inf)
+    for camera in renderer.model.indices("train"):
         pinhole = renderer.pinholes.of(camera)
-        in_cam = (in_model - trained.poses.cam_center_in_model[camera]) @ trained.poses.cam_from_model[camera].T
+        in_cam = (in_model - renderer.poses.cam_center_in_model[camera]) @ renderer.poses.cam_from_model[camera].T
         ahead = in_cam[:, 2] > 0
         pixel = pinhole.project(np.where(ahead[:, None], in_cam, [0.0, 0.0, 1.0]))
         detail[:, camera] = np.where(ahead & pinhole.contains(pixel), in_cam[:, 2] / pinhole.fx, np.inf)
@@ -110,15 +108,15 @@ def _seen_points(
     renderer: ModelRenderer, camera: int, plan: FloatArray, levels: FloatArray, reach_m: float
 ) -> FloatArray:
     """Return places (P, 3) in `geo` of the surface as a camera sees it around places in plan, without edges."""
-    trained, pose = renderer.trained, renderer.pose(camera)
+    pose = renderer.pose(camera)
     pinhole = pose.pinhole
     corners = np.concatenate([np.column_stack([plan, np.full(len(plan), level)]) for level in levels])
-    in_cam = (trained.geo_from_model.inverse().apply(corners) - pose.center_in_model) @ pose.cam_from_model.T
+    in_cam = (renderer.geo_from_model.inverse().apply(corners) - pose.center_in_model) @ pose.cam_from_model.T
     in_cam = in_cam[in_cam[:, 2] > 0]
     if not len(in_cam):
         return np.zeros((0, 3))
     pixel = pinhole.project(in_cam)
-    reach_px = reach_m * pinhole.fx / float(np.median(in_cam[:, 2])) / trained.geo_from_model.scale
+    reach_px = reach_m * pinhole.fx / float(np.median(in_cam[:, 2])) / renderer.geo_from_model.scale
     size = np.array([pinhole.width, pinhole.height])
     left, top = np.clip(np.floor(pixel.min(axis=0) - reach_px), 0, size - 1).astype(int).tolist()
     right, bottom = np.clip(np.ceil(pixel.max(axis=0) + reach_px), 1, size).astype(int).tolist()
@@ -132,13 +130,12 @@ def _seen_points(
     z = depth[::step, ::step][rows, columns].astype(np.float64)
     ray = pinhole.rays(np.column_stack([left + step * columns, top + step * rows]) + 0.5)
     in_model = (z[:, None] * ray) @ pose.cam_from_model + pose.center_in_model
-    return trained.geo_from_model.apply(in_model)
+    return renderer.geo_from_model.apply(in_model)
 
 
 def _agreed(renderer: ModelRenderer, plan: FloatArray, height: FloatArray) -> PlanHeights:
     """Return the surface on which the views' heights (N, C) agree."""
-    trained = renderer.trained
-    centers = trained.geo_from_model.apply(trained.poses.cam_center_in_model)
+    centers = renderer.geo_from_model.apply(renderer.poses.cam_center_in_model)
     middle_of_place = np.full(len(plan), np.nan)
     left = np.isfinite(height)
     for _ in range(LEAST_VIEWS + 1):  # a single view that is higher than the others is left out, and the next taken

@@ -1,17 +1,18 @@
 """Renders of the trained model, and its surface as its training cameras see it: depth maps to measure in.
 
-The maps of thousands of photographs exceed the memory. They lie in files of a scratch folder, mapped into memory.
-Maps are written one after the other. The size of a file therefore tells how many are complete, and an interrupted
-stage goes on after those.
+The maps of thousands of photographs exceed the memory. They lie in files of a folder, mapped into memory. Maps are
+written one after the other. The size of a file therefore tells how many are complete, and an interrupted stage goes
+on after those. In the workspace's cache, the next deliverable of the same model finds them.
 """
 
+import hashlib
 import os
 import shutil
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -19,16 +20,22 @@ import torch
 from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
-from pipelines.core.files import remove
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.stages import GAUSSIANS
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Pinhole, ViewPose, pose_matrix
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.splat.gaussians import Gaussians, read_gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, Window
+from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.spatial import SpatialBlocks
 from pipelines.splat.surface import measured_depth
 from pipelines.surface.visibility import DepthViews, Support, Viewpoints, support
 from pipelines.survey.photographs import ImageCache, Pinholes
-from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.survey.scene import photographs
+from pipelines.survey.solution import TrainedModel
+from pipelines.survey.survey import Survey
 
 _WINDOW_PX = 15
 _LEAST_SHARE = 0.5  # of the photograph's contrast, which the render must show
@@ -55,42 +62,69 @@ def photo_consistent(rendered: ByteArray, photograph: ByteArray) -> BoolArray:
 
 
 class ModelRenderer:
-    """Renderer of the trained model from its own cameras, at the size of its undistorted photographs."""
+    """Renderer of Gaussians from the cameras of their model, at the size of its undistorted photographs."""
 
-    def __init__(self, trained: TrainedSurvey, images: ImageCache, backend: Rasterizer) -> None:
-        self.trained, self.images = trained, images
-        self._backend = backend
-        self.pinholes = Pinholes(images, trained.sfm.lenses, trained.sparse.lenses)
-        self._gaussians = trained.gaussians.to(backend.device)
+    def __init__(
+        self,
+        model: TrainedModel,
+        sfm: SparseModel,
+        gaussians: Gaussians,
+        images: ImageCache,
+        backend: Rasterizer,
+    ) -> None:
+        self.model, self.gaussians, self.images, self.backend = model, gaussians, images, backend
+        self.sfm, self.sparse = sfm, model.with_lenses(sfm)
+        self.poses, self.geo_from_model = model.poses, model.similarity
+        self.pinholes = Pinholes(images, sfm.lenses, self.sparse.lenses)
+        self._on_device = gaussians.to(backend.device)
+
+    def showing(self, gaussians: Gaussians) -> "ModelRenderer":
+        """Return the renderer of other Gaussians in the place of the model's."""
+        if gaussians is self.gaussians:
+            return self
+        degree = min(self.model.sh_degree, gaussians.sh_degree)
+        model = self.model.model_copy(update={"sh_degree": degree})
+        return ModelRenderer(model, self.sfm, gaussians, self.images, self.backend)
 
     @cached_property
     def blocks(self) -> SpatialBlocks:
         """Gaussians sorted for windows: a second for a million, which the first window takes otherwise."""
-        return SpatialBlocks(self.trained.gaussians)
+        return SpatialBlocks(self.gaussians)
 
     @property
     def device(self) -> torch.device:
-        return self._backend.device
+        return self.backend.device
 
     def pose(self, index: int) -> ViewPose:
-        poses = self.trained.poses
+        poses = self.poses
         return ViewPose(self.pinholes.of(index), poses.cam_from_model[index], poses.cam_center_in_model[index])
 
     def render(self, view: int | ViewPose, *, depth: bool = False, window: Window | None = None) -> Render:
         """Return the render of a camera, by its index or from anywhere, or of a window of it, without gradients."""
-        model, pose = self.trained.model, view if isinstance(view, ViewPose) else self.pose(view)
+        model, pose = self.model, view if isinstance(view, ViewPose) else self.pose(view)
         matrix = pose_matrix(pose.cam_from_model, pose.center_in_model)
         settings = RasterSettings(model.sh_degree, model.background, depth=depth, window=window)
-        gaussians = self._gaussians
+        gaussians = self._on_device
         if window is not None:  # A pass over millions of Gaussians takes longer than the window itself.
-            gaussians = self.blocks.shown(matrix, pose.pinhole, settings).to(gaussians.means.device)
+            gaussians = self.blocks.in_view(matrix, pose.pinhole, settings).to(gaussians.means.device)
         cam_from_model = torch.as_tensor(matrix, dtype=torch.float32, device=gaussians.means.device)
         with torch.no_grad():
-            return self._backend.render(gaussians, cam_from_model, pose.pinhole, settings)
+            return self.backend.render(gaussians, cam_from_model, pose.pinhole, settings)
 
     def depth_m(self, view: int | ViewPose, window: Window | None = None) -> FloatArray:
         """Return the depth (H, W) in metres of the surface along the z axis of a camera; 0: no surface."""
         return np.asarray(measured_depth(self.render(view, depth=True, window=window)).cpu().numpy())
+
+    def key(self) -> str:
+        """Return a hash of all that the surface in the training views depends on; errors as of `ImageCache.key`."""
+        model, poses, found = self.model, self.poses, hashlib.sha256(self.backend.name.encode())
+        found.update(repr((model.sh_degree, model.background, model.mip_filter)).encode())
+        for values in (*self.gaussians.tensors().values(), poses.cam_from_model, poses.cam_center_in_model):
+            found.update(np.ascontiguousarray(values).data)
+        for index in self.model.indices("train"):
+            masked = self.images.mask_key(index) if self.images.is_masked(index) else ""
+            found.update(f"{self.images.key(index)}|{masked}|{self.pinholes.of(index)}".encode())
+        return found.hexdigest()[:32]
 
     def surface(self, index: int) -> tuple[Float32Array, ByteArray]:
         """Return the depth (H, W) of camera `index`, 0 where masked, and the colours (H, W, 3) of its render."""
@@ -100,6 +134,24 @@ class ModelRenderer:
         if self.images.is_masked(index):
             depth[~self.images.mask(index)] = 0
         return depth, rgb.cpu().numpy()
+
+
+def model_renderer(
+    workspace: Workspace,
+    model: TrainedModel,
+    sfm: SparseModel,
+    survey: Survey,
+    *,
+    backend: Literal["auto", "cpu", "cuda"] = "auto",
+    progress: Progress = SILENT,
+) -> ModelRenderer:
+    """Return the renderer of a workspace's Gaussians, by a backend; errors as of `rasterizer`, `read_gaussians`.
+
+    The undistorted photographs are built by whoever needs them all.
+    """
+    gaussians = read_gaussians(workspace.path(GAUSSIANS))
+    images = photographs(sfm, survey, workspace, model.max_image_size)
+    return ModelRenderer(model, sfm, gaussians, images, rasterizer(backend, progress, mip_filter=model.mip_filter))
 
 
 # The trained surface of a simulated flight departs from the true one by less than 0.5 % of the depth at nine of ten
@@ -133,7 +185,7 @@ class SurfaceViews:
     """Depth maps of all training cameras, at the photographs' training size; an InputError: the disk is too small.
 
     Args:
-        folder: scratch folder, made if missing. It belongs to the maps alone: maps that are there are continued.
+        folder: made if missing. It belongs to these maps alone: those that are there are continued.
         colours: keep the colours of the renders too.
         confirmed: keep only depths where render and photograph agree (`photo_consistent`).
     """
@@ -148,8 +200,8 @@ class SurfaceViews:
         progress: Progress = SILENT,
     ) -> None:
         self.folder = folder
-        self._trained, self._images = renderer.trained, renderer.images
-        self.cameras = renderer.trained.indices("train")
+        self._model, self._poses, self._images = renderer.model, renderer.poses, renderer.images
+        self.cameras = renderer.model.indices("train")
         self.pinholes = tuple(renderer.pinholes.of(index) for index in self.cameras)
         pixels = [pinhole.width * pinhole.height for pinhole in self.pinholes]
         self._start = np.concatenate([[0], np.cumsum(pixels)]).astype(np.int64)
@@ -167,7 +219,7 @@ class SurfaceViews:
 
     def view(self, number: int) -> SurfaceView:
         """Return view `number` of 0 … len − 1."""
-        camera, pinhole, poses = self.cameras[number], self.pinholes[number], self._trained.poses
+        camera, pinhole, poses = self.cameras[number], self.pinholes[number], self._poses
         part, size = slice(*self._start[number : number + 2]), (pinhole.height, pinhole.width)
         rgb = None if self._rgb is None else self._rgb[part].reshape(*size, 3)
         return SurfaceView(
@@ -187,14 +239,14 @@ class SurfaceViews:
         Unit normals (N, 3) have an arbitrary sign; NaN: unknown. Depths of one surface agree within the tolerance,
         a part of the depth.
         """
-        geo_from_model = self._trained.geo_from_model
+        geo_from_model = self._model.similarity
         up_in_model = geo_from_model.rotation.T @ [0.0, 0.0, 1.0]
         found = support(point_in_model, self.depth_views(), up_in_model, tolerance, normal_in_model)
         return found.scaled(geo_from_model.scale)
 
     def depth_views(self) -> DepthViews:
         """Return the maps with their cameras in `model`, for kernels."""
-        poses = self._trained.poses
+        poses = self._poses
         rotation, center = poses.cam_from_model[self.cameras], poses.cam_center_in_model[self.cameras]
         return DepthViews.of(Viewpoints(rotation, center, self.pinholes), self._depth)
 
@@ -203,14 +255,17 @@ class SurfaceViews:
 
         The matrix applies to homogeneous colours of 0 … 255; it changes nothing where the exposure is not known.
         """
-        camera = self.cameras[number]
-        photograph, exposure = self._images.image(camera), self._trained.model.cameras[camera].exposure
+        return self._images.image(self.cameras[number]), self.light(number)
+
+    def light(self, number: int) -> FloatArray:
+        """Return the matrix (3, 4) that undoes the exposure of a view's photograph, as `photograph` does."""
+        exposure = self._model.cameras[self.cameras[number]].exposure
         gain, offset = np.split(np.eye(3, 4) if exposure is None else np.array(exposure), [3], axis=1)
-        return photograph, np.linalg.solve(gain, np.column_stack([np.eye(3), -255 * offset]))
+        return np.asarray(np.linalg.solve(gain, np.column_stack([np.eye(3), -255 * offset])))
 
     def close(self) -> None:
+        """Release the files."""
         del self._depth, self._rgb
-        remove(self.folder)
 
     def _render(self, renderer: ModelRenderer, colours: bool, progress: Progress) -> None:
         """Append the maps that are missing to the files."""

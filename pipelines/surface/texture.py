@@ -6,6 +6,7 @@ faces. Where a chart folds over itself, both layers share their texels.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
+from pipelines.geometry.footprints import row_numbers, voxel_keys
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.kernel_cache import kernel
 from pipelines.surface.mesh import RawMesh, edges_of, vertex_normals
@@ -25,7 +27,7 @@ from pipelines.surface.visibility import point_in_cam, sees_sphere, surface_at
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
 _BEST = 4  # photographs that a colour is the mean of
-_BATCH = 1_000_000  # places that are coloured at once
+_BATCH, _GROUP = 1_000_000, 20_000  # places that are coloured at once, and that are asked for together in a view
 _GREY = 128  # where no photograph shows anything
 _BLOCK_TEXELS, _PADDING = 64, 2  # side of the blocks of charts, and texels around a chart
 _LARGEST = 8192  # texels along a side, which viewers load
@@ -45,27 +47,40 @@ class TexturedMesh:
     texel_m: float
 
 
-def colours_of(
+def photographed_colours(
     points: FloatArray, normals: FloatArray, views: SurfaceViews, frame_from_model: Similarity
 ) -> tuple[ByteArray, BoolArray]:
     """Return the colours (N, 3) of places (N, 3) of the frame with unit normals (N, 3), and where one is known."""
     maps, rgb = views.depth_views(), np.full((len(points), 3), _GREY, np.uint8)
     cameras = tuple(vars(maps).values())
+    photograph = cache(views.photograph)
     known = np.zeros(len(points), dtype=bool)
     for first in range(0, len(points), _BATCH):
         part = slice(first, first + _BATCH)
         place = frame_from_model.inverse().apply(points[part])
-        normal = np.ascontiguousarray(normals[part] @ frame_from_model.rotation)
-        score, colour = np.zeros((len(place), _BEST), np.float32), np.zeros((len(place), _BEST, 3), np.float32)
-        middle, radius = place.mean(axis=0), float(np.linalg.norm(np.ptp(place, axis=0)))
-        for view in range(len(views)):
-            if sees_sphere(middle, radius, *(values[view] for values in cameras[:4])):
-                _add_colours(place, normal, cameras, view, *views.photograph(view), score, colour)
-        total = score.sum(axis=1, keepdims=True)
-        known[part] = total[:, 0] > 0
-        mean = (score[..., None] * colour).sum(axis=1) / np.maximum(total, np.finfo(np.float32).tiny)
-        rgb[part][known[part]] = np.clip(np.round(mean[known[part]]), 0, 255)
+        normal = np.asarray(normals[part] @ frame_from_model.rotation)
+        for rows in _near_each_other(place):
+            near, towards = np.ascontiguousarray(place[rows]), np.ascontiguousarray(normal[rows])
+            score, colour = np.zeros((len(rows), _BEST), np.float32), np.zeros((len(rows), _BEST, 3), np.float32)
+            low, high = near.min(axis=0), near.max(axis=0)
+            middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 1.99
+            for view in range(len(views)):
+                if sees_sphere(middle, radius, *(values[view] for values in cameras[:4])):
+                    _add_colours(near, towards, cameras, view, *photograph(view), score, colour)
+            total = score.sum(axis=1, keepdims=True)
+            seen = total[:, 0] > 0
+            mean = (score[..., None] * colour).sum(axis=1) / np.maximum(total, np.finfo(np.float32).tiny)
+            known[first + rows] = seen
+            rgb[first + rows[seen]] = np.clip(np.round(mean[seen]), 0, 255)
     return rgb, known
+
+
+def _near_each_other(places: FloatArray) -> list[IntArray]:
+    """Return the rows of places (N, 3) in groups of about `_GROUP` in one part of the space: few views see each."""
+    side = float(np.ptp(places, axis=0).max()) / max((len(places) / _GROUP) ** 0.5, 1.0)
+    key = voxel_keys(places, max(side, 1e-6))
+    order = np.argsort(key, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
 
 
 @kernel(parallel=True, nogil=True, error_model="numpy")
@@ -130,10 +145,10 @@ def textured(
         grey, axis = len(axis), np.append(axis, 0)
         chart = np.append(chart, np.full(len(mesh.faces) - len(chart), grey))
         # A vertex of two charts becomes two.
-        corner, member = np.unique(
-            np.column_stack([np.repeat(chart, 3), mesh.faces.ravel()]), axis=0, return_inverse=True
-        )
-        of_chart, vertices, faces = corner[:, 0], mesh.vertices[corner[:, 1]], member.reshape(-1, 3)
+        total = max(len(mesh.vertices), 1)
+        corner, member = np.unique(np.repeat(chart, 3) * total + mesh.faces.ravel(), return_inverse=True)
+        (of_chart, shown), faces = np.divmod(corner, total), member.reshape(-1, 3)
+        vertices = mesh.vertices[shown]
         plane = np.array([[1, 2], [0, 2], [0, 1]])[axis[of_chart]]
         flat = np.take_along_axis(vertices, plane, axis=1)
         flat[of_chart == grey] = 0
@@ -149,14 +164,14 @@ def textured(
             texel_m *= _COARSER
         at = place[of_chart] + _PADDING + 0.5 + (flat - low[of_chart]) / texel_m  # in texels: column, row
         task.advance()
-        normal = vertex_normals(mesh)[corner[:, 1]]
+        normal = vertex_normals(mesh)[shown]
         image, empty = np.full((side * side, 3), _GREY, np.uint8), np.ones(side * side, dtype=bool)
         column, row = place[grey] + _PADDING
         empty[row * side + column] = False
         for part in _batches(at, faces[:surface_faces]):
             face, weight, texel = _texels(at, part, side)
             places, towards = (np.einsum("nk,nkj->nj", weight, of[part[face]]) for of in (vertices, normal))
-            rgb, known = colours_of(places, towards, views, frame_from_model)
+            rgb, known = photographed_colours(places, towards, views, frame_from_model)
             image[texel[known]], empty[texel[known]] = rgb[known], False
         task.advance()
         if not empty.all():
@@ -173,7 +188,7 @@ def _charts(mesh: RawMesh, block_m: float) -> tuple[IntArray, IntArray]:
     axis = np.abs(normal).argmax(axis=1)
     side = np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0
     block = np.floor((a + b + c) / (3 * block_m)).astype(np.int64)
-    kind = np.unique(np.column_stack([block, axis, side]), axis=0, return_inverse=True)[1].ravel()
+    kind = row_numbers(np.column_stack([block, axis, side]))
     # Faces of one kind that share an edge belong together.
     edge, _ = edges_of(mesh.faces)
     owner, order = np.repeat(np.arange(len(mesh.faces)), 3), np.argsort(edge, kind="stable")

@@ -31,7 +31,7 @@ from pipelines.splat.kernel_cache import kernel
 
 # Largest range of the depths of four pixels of one surface, as a part of them: ground under 5° at f = 500 px.
 _ONE_SURFACE = 0.04
-_BLOCK = 512  # points that share a choice of cameras
+_BLOCK = 128  # points that share a choice of cameras
 _CELLS = 256  # across the points' extent, to sort them into blocks
 _NEAR = 1e-6  # least depth
 
@@ -136,15 +136,19 @@ def support(
 
 
 def _blocks(points: FloatArray) -> IntArray:
-    """Return the points' indices, ordered so that consecutive ones lie close together."""
+    """Return the points' indices, ordered so that consecutive ones lie close together (Morton's order of cells)."""
     low = points.min(axis=0)
     size = max(float(np.ptp(points, axis=0).max()), _NEAR) / _CELLS
-    cell = ((points - low) / size).astype(np.int64)
-    return np.argsort((cell[:, 2] * (_CELLS + 1) + cell[:, 1]) * (_CELLS + 1) + cell[:, 0], kind="stable")
+    cell = np.minimum(((points - low) / size).astype(np.int64), _CELLS - 1)
+    spread = np.zeros(_CELLS, np.int64)
+    for bit in range(_CELLS.bit_length() - 1):
+        spread |= (np.arange(_CELLS) >> bit & 1) << 3 * bit
+    return np.argsort(spread[cell] @ [1, 2, 4], kind="stable")
 
 
 @njit(nogil=True, error_model="numpy")
 def point_in_cam(point: Any, rotation: Any, center: Any) -> tuple[float, float, float]:
+    """Return a point in the camera's axes, from world coordinates, rotation cam ← world (3, 3) and centre."""
     x, y, z = 0.0, 0.0, 0.0
     for k in range(3):
         d = point[k] - center[k]
@@ -191,43 +195,52 @@ def surface_at(depth: Any, start: int, width: int, height: int, u: float, v: flo
 
 
 @njit(nogil=True, error_model="numpy")
-def _add_view(point: Any, normal: Any, views: Any, view: int, up: Any, tolerance: float, total: Any) -> None:
-    rotations, centers, intrinsics_px, sizes, starts, depth = views
-    center, intrinsics, size = centers[view], intrinsics_px[view], sizes[view]
-    x, y, z = point_in_cam(point, rotations[view], center)
+def _add_view(
+    row: int, points: Any, normals: Any, views: Any, view: int, up: Any, tolerance: float, sums: Any
+) -> None:
+    """Add a view to the sums of a point. Numbers rather than rows of arrays, each of which would be counted."""
+    rotations, centers, intrinsics, sizes, starts, depth = views
+    dx, dy, dz = (
+        points[row, 0] - centers[view, 0],
+        points[row, 1] - centers[view, 1],
+        points[row, 2] - centers[view, 2],
+    )
+    z = rotations[view, 2, 0] * dx + rotations[view, 2, 1] * dy + rotations[view, 2, 2] * dz
     if z <= _NEAR:
         return
-    u = intrinsics[0] * x / z + intrinsics[2]
-    v = intrinsics[1] * y / z + intrinsics[3]
-    if not (u >= 0 and u < size[0] and v >= 0 and v < size[1]):
+    width, height = sizes[view, 0], sizes[view, 1]
+    x = rotations[view, 0, 0] * dx + rotations[view, 0, 1] * dy + rotations[view, 0, 2] * dz
+    u = intrinsics[view, 0] * x / z + intrinsics[view, 2]
+    if not (u >= 0 and u < width):
         return
-    surface = surface_at(depth, starts[view], size[0], size[1], u, v)
+    y = rotations[view, 1, 0] * dx + rotations[view, 1, 1] * dy + rotations[view, 1, 2] * dz
+    v = intrinsics[view, 1] * y / z + intrinsics[view, 3]
+    if not (v >= 0 and v < height):
+        return
+    surface = surface_at(depth, starts[view], width, height, u, v)
     if surface <= 0:
         return
     difference = surface - z
     if difference > tolerance * z:
-        total[_THROUGH] += 1
+        sums[row, _THROUGH] += 1
     if abs(difference) > tolerance * z:
         return
     ratio = difference / z
-    upwards, along, square, length = 0.0, 0.0, 0.0, 0.0
-    for k in range(3):
-        d = point[k] - center[k]
-        residual = ratio * d
-        upwards += residual * up[k]
-        along += residual * normal[k]
-        square += residual * residual
-        length += d * d
-    length = np.sqrt(length)
-    for k in range(3):
-        total[_DIRECTION + k] += (point[k] - center[k]) / length
-    total[_VIEWS] += 1
-    total[_UP] += upwards
-    total[_UP2] += upwards * upwards
-    total[_HORIZONTAL2] += max(square - upwards * upwards, 0.0)
-    total[_Z2] += difference * difference
-    total[_NORMAL] += along
-    total[_NORMAL2] += along * along
+    to_x, to_y, to_z = ratio * dx, ratio * dy, ratio * dz
+    upwards = to_x * up[0] + to_y * up[1] + to_z * up[2]
+    along = to_x * normals[row, 0] + to_y * normals[row, 1] + to_z * normals[row, 2]
+    square = to_x * to_x + to_y * to_y + to_z * to_z
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    sums[row, _DIRECTION] += dx / length
+    sums[row, _DIRECTION + 1] += dy / length
+    sums[row, _DIRECTION + 2] += dz / length
+    sums[row, _VIEWS] += 1
+    sums[row, _UP] += upwards
+    sums[row, _UP2] += upwards * upwards
+    sums[row, _HORIZONTAL2] += max(square - upwards * upwards, 0.0)
+    sums[row, _Z2] += difference * difference
+    sums[row, _NORMAL] += along
+    sums[row, _NORMAL2] += along * along
 
 
 @njit(nogil=True, error_model="numpy")
@@ -245,7 +258,7 @@ def _sum_block(rows: Any, points: Any, normals: Any, views: Any, up: Any, tolera
         if not sees_sphere(middle, radius, rotations[view], centers[view], intrinsics[view], sizes[view]):
             continue
         for row in rows:
-            _add_view(points[row], normals[row], views, view, up, tolerance, sums[row])
+            _add_view(row, points, normals, views, view, up, tolerance, sums)
 
 
 @kernel(parallel=True, nogil=True, error_model="numpy")

@@ -1,7 +1,7 @@
-"""Products of `init-sim3` and `geolocate`: similarity from the SfM model to the Earth, and SfM points on Earth."""
+"""Parts of the solution, the verdict on measurements and the similarity before it; and SfM points on Earth."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,38 +19,30 @@ from pipelines.survey.report_parts import (
 from pipelines.survey.survey import Survey
 
 
-class InitialSimilarity(Product):
-    """Product of `init-sim3`: `geo_from_local`, its estimation and its precision.
+class MeasurementVerdict(Product):
+    """What `init-sim3` has decided of the measurements, which every later stage keeps.
 
     Attributes:
-        method: `robust` or `paper`, the option of `init-sim3`; `adjusted` by the bundle adjustment of the baseline.
-        correspondences, inliers: numbers by kind, of all and of those that agree with the similarity: `gnss`
-            (camera centres with fixes), `gcp` (control points), `points` (intersected points).
-        gnss_outliers, control_outliers: names of the images whose fixes, and of the control points that were
-            rejected, or that their marks do not determine: they enter no later solution.
-        condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.
-        layout: extent of the correspondences: they fill a volume, lie in a plane, or on a line.
+        gnss_outliers, control_outliers, distance_outliers: names of the images whose fixes, of the control points
+            and of the distances that were rejected, or that their marks do not determine: they enter no solution.
         variance_factors: tests of the stated σ, with the factors that apply to all later stages.
         tied: whether points in common with an earlier date take part.
         common_outliers: COLMAP's ids of those that were rejected.
+        cautions: limits of the solution.
     """
 
-    format_version: Literal[1] = 1
-    geo_from_local: SimilarityRecord
-    method: Literal["robust", "paper", "adjusted"]
-    correspondences: dict[str, int]
-    inliers: dict[str, int]
     gnss_outliers: tuple[str, ...] = ()
     control_outliers: tuple[str, ...] = ()
     distance_outliers: tuple[str, ...] = ()
-    residuals: dict[str, ResidualStats]
-    condition_number: float
-    layout: Literal["volume", "plane", "line"]
-    attitude_used: bool
     variance_factors: tuple[VarianceFactor, ...] = ()
     tied: bool = False
     common_outliers: tuple[int, ...] = ()
     cautions: tuple[Remark, ...] = ()
+
+    @property
+    def verdict(self) -> dict[str, Any]:
+        """Values of these fields, for another product that keeps them."""
+        return {name: getattr(self, name) for name in MeasurementVerdict.model_fields}
 
     def weighted(self, survey: Survey) -> Survey:
         """Return a survey with the applied variance factors in its covariances."""
@@ -83,6 +75,28 @@ class InitialSimilarity(Product):
         return survey.model_copy(
             update={"images": images, "control_points": control, "distances": distances, "common": common}
         )
+
+
+class SimilarityEstimate(Product):
+    """How `init-sim3` has found the similarity of the SfM model, and how well its correspondences agree with it.
+
+    Attributes:
+        geo_from_local: of a joint adjustment, that of its solution.
+        method: `robust` or `paper`, the option of `init-sim3`; `adjusted` by the bundle adjustment of the baseline.
+        correspondences, inliers: numbers by kind, of all and of those that agree with the similarity: `gnss`
+            (camera centres with fixes), `gcp` (control points), `points` (intersected points).
+        condition_number: of the normal matrix, with angles and ln s scaled by the size of the layout.
+        layout: extent of the correspondences: they fill a volume, lie in a plane, or on a line.
+    """
+
+    geo_from_local: SimilarityRecord
+    method: Literal["robust", "paper", "adjusted"]
+    correspondences: dict[str, int]
+    inliers: dict[str, int]
+    residuals: dict[str, ResidualStats]
+    condition_number: float
+    layout: Literal["volume", "plane", "line"]
+    attitude_used: bool
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,14 @@ from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef, lla_from_enu
 from pipelines.geometry.cameras import project
 from pipelines.geometry.footprints import PointSurface, border_rays
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.boundaries import Outlines, read_outlines
 from pipelines.survey.options import LEAST_PHOTOGRAPHS, AreaOptions
+from pipelines.survey.solution import Solution
 from pipelines.survey.target_crs import TargetCrs
-from pipelines.survey.trained_survey import SolvedSurvey
 
 _CELLS = 120  # along the longer side of the scene
+_OUTSIDE = 0.002  # fraction of the SfM points outside the extent of files on each side
 _RIM = 0.01  # fraction of the scene's points outside the raster on each side
 _FARTHEST_CELLS = 6.0  # distance from a point of the scene beyond which there is no scene
 _COARSEST = 1.5  # largest width of a pixel on the ground over the median: beyond, rasters would promise too much
@@ -76,14 +78,14 @@ class Overlap:
     cell_m: float
 
 
-def seen_area(solved: SolvedSurvey, scene: FloatArray) -> Area:
-    """Return the ground that enough photographs see, of a survey with points (N, 3) in `geo`.
+def seen_area(solution: Solution, sfm: SparseModel, scene: FloatArray) -> Area:
+    """Return the ground that enough photographs see, of a scene with points (N, 3) in `geo`.
 
     Raises:
         DegenerateGeometryError: there is none.
     """
     level_m = float(np.median(scene[:, 2])) if len(scene) else 0.0
-    return Area(_seen_ground(solved, scene), level_m, f"ground that {LEAST_PHOTOGRAPHS} photographs see")
+    return Area(_seen_ground(solution, sfm, scene), level_m, f"ground that {LEAST_PHOTOGRAPHS} photographs see")
 
 
 def boundary_area(options: AreaOptions, scene: FloatArray, origin: Origin | None) -> Area | None:
@@ -96,8 +98,9 @@ def boundary_area(options: AreaOptions, scene: FloatArray, origin: Origin | None
     if options.boundary is None:
         return None
     if origin is None:
-        message = "The survey has a local metric frame, in which a boundary has no place. Remove --boundary."
-        raise InputError("not-on-earth", message, field="--boundary")
+        message = "The survey has a local metric frame, in which a boundary has no place."
+        remedy = "Remove --boundary."
+        raise InputError("not-on-earth", message, field="--boundary", remedy=remedy)
     path = options.boundary
     outlines = read_outlines(
         path,
@@ -119,8 +122,9 @@ def boundary_area(options: AreaOptions, scene: FloatArray, origin: Origin | None
     polygon = shapely.union_all([moved(one) for one in outlines])
     area = Area(polygon, float(np.median(scene[:, 2])) if len(scene) else 0.0, path.name)
     if not area.contains(scene).any():
-        message = "holds no point of the survey. Check its CRS (--boundary-crs), and that it is of this place."
-        raise InputError("boundary-elsewhere", message, path=path, field="--boundary")
+        message = "holds no point of the survey."
+        remedy = "Check its CRS (--boundary-crs), and that it is of this place."
+        raise InputError("boundary-elsewhere", message, path=path, field="--boundary", remedy=remedy)
     return area
 
 
@@ -129,10 +133,29 @@ def _with_short_edges(polygon: Any) -> Any:
     return shapely.segmentize(polygon, max(east - west, north - south) / _EDGES)
 
 
-def scene_in_geo(solved: SolvedSurvey) -> FloatArray:
+def scene_points(solution: Solution, sfm: SparseModel) -> FloatArray:
+    """Return the SfM points (P, 3) in `geo` that lie within the scene: those at its rim are left out.
+
+    Raises:
+        DegenerateGeometryError: the SfM model has no points.
+    """
+    if not len(sfm.point_in_local):
+        raise DegenerateGeometryError("no-sfm-points", "The SfM model has no points, so the extent is unknown.")
+    points = solution.similarity.apply(solution.point_in_model(sfm))
+    low, high = np.quantile(points[:, :2], [_OUTSIDE, 1 - _OUTSIDE], axis=0)
+    return np.asarray(points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)])
+
+
+def corners(points: FloatArray) -> FloatArray:
+    """Return the corners (8, 3) of the box around points."""
+    box = np.stack([points.min(axis=0), points.max(axis=0)])
+    return np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def scene_in_geo(solution: Solution, sfm: SparseModel) -> FloatArray:
     """Return the SfM points (N, 3) in `geo` that three photographs show, without the highest and lowest."""
-    rays = np.bincount(solved.sfm.obs_point, minlength=len(solved.sfm.point_in_local))
-    return without_outliers(solved.geo_from_model.apply(solved.point_in_model[rays >= LEAST_RAYS]))
+    rays = np.bincount(sfm.obs_point, minlength=len(sfm.point_in_local))
+    return without_outliers(solution.similarity.apply(solution.point_in_model(sfm)[rays >= LEAST_RAYS]))
 
 
 def without_outliers(points: FloatArray) -> FloatArray:
@@ -143,7 +166,9 @@ def without_outliers(points: FloatArray) -> FloatArray:
     return np.asarray(points[(points[:, 2] >= low) & (points[:, 2] <= high)])
 
 
-def overlap_of(solved: SolvedSurvey, scene: FloatArray, *, coarsest_m: float = np.inf) -> Overlap | None:
+def overlap_of(
+    solution: Solution, sfm: SparseModel, scene: FloatArray, *, coarsest_m: float = np.inf
+) -> Overlap | None:
     """Return the overlap of the photographs over the scene's points (N, 3); None: they span no area.
 
     A cell is a point on the surface through these points. What stands before it is not asked for. A photograph
@@ -162,14 +187,14 @@ def overlap_of(solved: SolvedSurvey, scene: FloatArray, *, coarsest_m: float = n
     known = np.flatnonzero(distance <= _FARTHEST_CELLS * cell)
     points = np.column_stack([place[known], PointSurface(scene).heights(place[known])])
     count = np.full(rows * columns, -1, dtype=np.int64)
-    count[known] = photographs_that_see(solved, points, coarsest_m)
+    count[known] = photographs_that_see(solution, sfm, points, coarsest_m)
     return Overlap(count.reshape(rows, columns), low, cell)
 
 
-def _seen_ground(solved: SolvedSurvey, scene: FloatArray) -> Polygon:
+def _seen_ground(solution: Solution, sfm: SparseModel, scene: FloatArray) -> Polygon:
     """Return the largest part of the ground that enough photographs see, without holes, smoothly bounded."""
-    depth_m, focal_px = depths_of_observations(solved)
-    overlap = overlap_of(solved, scene, coarsest_m=_COARSEST * float(np.median(depth_m / focal_px)))
+    depth_m, focal_px = depths_of_observations(solution, sfm)
+    overlap = overlap_of(solution, sfm, scene, coarsest_m=_COARSEST * float(np.median(depth_m / focal_px)))
     parts: list[Polygon] = []
     if overlap is not None:
         seen = np.pad(overlap.count >= LEAST_PHOTOGRAPHS, 1).astype(np.float64)
@@ -180,51 +205,50 @@ def _seen_ground(solved: SolvedSurvey, scene: FloatArray) -> Polygon:
         opened = shapely.union_all(shapely.make_valid(rings)).buffer(-reach).buffer(2 * reach).buffer(-reach)
         parts = [part for part in shapely.get_parts(opened) if part.area > 0]
     if overlap is None or not parts:
-        message = (
-            f"No ground is seen by {LEAST_PHOTOGRAPHS} photographs. Give the area of interest with --boundary, or "
-            "add photographs."
-        )
-        raise DegenerateGeometryError("no-common-ground", message)
+        message = f"No ground is seen by {LEAST_PHOTOGRAPHS} photographs."
+        remedy = "Give the area of interest with --boundary, or add photographs."
+        raise DegenerateGeometryError("no-common-ground", message, remedy=remedy)
     largest = Polygon(max(parts, key=lambda part: float(part.area)).exterior)
     return max(shapely.get_parts(largest.simplify(overlap.cell_m / 2)), key=lambda part: float(part.area))
 
 
-def depths_of_observations(solved: SolvedSurvey) -> tuple[FloatArray, FloatArray]:
+def depths_of_observations(solution: Solution, sfm: SparseModel) -> tuple[FloatArray, FloatArray]:
     """Return the depth (K,) of each observation in metres on the ground, and its camera's focal length (K,)."""
-    sfm, poses = solved.sfm, solved.poses
-    arm = solved.point_in_model[sfm.obs_point] - poses.cam_center_in_model[sfm.obs_image]
+    poses = solution.poses
+    arm = solution.point_in_model(sfm)[sfm.obs_point] - poses.cam_center_in_model[sfm.obs_image]
     depth = np.einsum("kj,kj->k", poses.cam_from_model[sfm.obs_image][:, 2], arm)
-    return solved.geo_from_model.scale * depth, solved.sparse.focal_px[sfm.obs_image]
+    return solution.similarity.scale * depth, solution.with_lenses(sfm).focal_px[sfm.obs_image]
 
 
-def ground_sampling_m(solved: SolvedSurvey) -> float | None:
+def ground_sampling_m(solution: Solution, sfm: SparseModel) -> float | None:
     """Return the ground sampling distance, the median of a pixel's size at the SfM points; None: no points."""
-    depth_m, focal_px = depths_of_observations(solved)
+    depth_m, focal_px = depths_of_observations(solution, sfm)
     return float(np.median(depth_m / focal_px)) if len(depth_m) else None
 
 
-def photographs_that_see(solved: SolvedSurvey, point_in_geo: FloatArray, coarsest_m: float = np.inf) -> IntArray:
+def photographs_that_see(
+    solution: Solution, sfm: SparseModel, point_in_geo: FloatArray, coarsest_m: float = np.inf
+) -> IntArray:
     """Return the number (K,) of registered photographs whose frame holds points (K, 3); nothing hides a point.
 
     Photographs whose pixels are wider there than `coarsest_m` do not count.
     """
-    in_model = solved.geo_from_model.inverse().apply(point_in_geo)
+    sparse, poses, geo_from_model = solution.with_lenses(sfm), solution.poses, solution.similarity
+    in_model = geo_from_model.inverse().apply(point_in_geo)
     # Tangent of the widest angle from the axis that a camera's frame shows.
     widest = {
         key: float(np.linalg.norm(border_rays(camera)[:, :2], axis=1).max(initial=0.0)) * (1 + 1e-9)
-        for key, camera in solved.sparse.cameras.items()
+        for key, camera in sparse.cameras.items()
     }
     count = np.zeros(len(point_in_geo), dtype=np.int64)
-    for index, (rotation, center) in enumerate(
-        zip(solved.poses.cam_from_model, solved.poses.cam_center_in_model, strict=True)
-    ):
-        camera = solved.sparse.camera_of(index)
+    for index, (rotation, center) in enumerate(zip(poses.cam_from_model, poses.cam_center_in_model, strict=True)):
+        camera = sparse.camera_of(index)
         in_cam = (in_model - center) @ rotation.T
-        farthest = coarsest_m * camera.mean_focal_px / solved.geo_from_model.scale
+        farthest = coarsest_m * camera.mean_focal_px / geo_from_model.scale
         # Beyond the widest ray of the frame, the polynomial of a lens can fold back into it.
         ahead = np.flatnonzero((in_cam[:, 2] > 0) & (in_cam[:, 2] <= farthest))
         slope = np.linalg.norm(in_cam[ahead, :2], axis=1) / in_cam[ahead, 2]
-        ahead = ahead[slope <= widest[int(solved.sparse.image_camera_id[index])]]
+        ahead = ahead[slope <= widest[int(sparse.image_camera_id[index])]]
         pixel = project(camera, in_cam[ahead])
         seen = ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(axis=1)
         count[ahead[seen]] += 1

@@ -69,14 +69,14 @@ def read_outlines(
     """
     boundary = read_boundary(path, field=field)
     for remark in boundary.remarks:
-        log.warning("%s", remark.sentence, extra={"code": remark.code})
+        log.warning("%s", remark.text, extra={"code": remark.code})
     refusal = partial(InputError, path=path, field=crs_field)
     found = []
     for layer in boundary.layers:
         text = _crs_text(layer, crs, path, crs_field)
         if not text:
             of_layer = f"layer {layer.name} " if len(boundary.layers) > 1 and layer.name else ""
-            raise refusal("boundary-without-crs", f"{of_layer}states no CRS. Give {crs_field}.")
+            raise refusal("boundary-without-crs", f"{of_layer}states no CRS.", remedy=f"Give {crs_field}.")
         own = parse_crs(text, path=path, field=crs_field)
         outlines = Outlines(layer.polygons, own, layer.name)
         if layer.crs_is_default and text == layer.crs:
@@ -135,8 +135,11 @@ def _require_degrees(outlines: Outlines, refusal: Any, crs_field: str) -> None:
     if max(abs(west), abs(east)) > 720 or max(abs(south), abs(north)) > 90:
         raise refusal(
             "boundary-no-degrees",
-            f"names no CRS, so that its coordinates are longitude and latitude in degrees, but they reach from "
-            f"({west:.10g}, {south:.10g}) to ({east:.10g}, {north:.10g}). Give {crs_field}.",
+            (
+                "names no CRS, so that its coordinates are longitude and latitude in degrees, but they reach from "
+                f"({west:.10g}, {south:.10g}) to ({east:.10g}, {north:.10g})."
+            ),
+            remedy=f"Give {crs_field}.",
         )
 
 

@@ -97,9 +97,9 @@ def load_track(workspace: Workspace) -> NavigationTrack:
     except MissingProductError as error:
         raise InputError(
             "navigation-not-recorded",
-            "The survey has one position for each image, and no navigation with times. Run `georef ingest` with "
-            "--bag, or with a --trajectory that has times.",
+            "The survey has one position for each image, and no navigation with times.",
             path=workspace.root / TRACK,
+            remedy="Run `georef ingest` with --bag, or with a --trajectory that has times.",
         ) from error
     return NavigationTrack.load(path)
 
@@ -124,7 +124,9 @@ def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParamet
         raise refusal("no-attitudes", "lever-arm needs attitudes, which were not recorded")
     if "lever-arm" in wanted and not track.body_known:
         raise refusal(
-            "body-axes-unknown", "lever-arm needs the axes of the body. Give --camera-mount YAW,PITCH,ROLL."
+            "body-axes-unknown",
+            "lever-arm needs the axes of the body.",
+            remedy="Give --camera-mount YAW,PITCH,ROLL.",
         )
     mounted = bool(np.isfinite(track.cam_from_body).all(axis=(1, 2)).any())
     if "boresight" in wanted and not (turned and mounted):

@@ -8,7 +8,7 @@ from pipelines.core.products import Product
 from pipelines.core.types import Vector3
 
 
-class Registration(Product):
+class EpochShift(Product):
     """Shift of the later epoch against the earlier one on unchanged ground, east, north, up.
 
     Attributes:
@@ -67,6 +67,34 @@ class ChangedRegion(Product):
     highest_m: float
 
 
+class DoubtfulRegion(ChangedRegion):
+    """Found region that counts as no change, by its name: D. `reason` is the code of the warning that says why."""
+
+    reason: str
+
+
+class RegionAtDate(Product):
+    """Net volume of a region at a date against the earlier epoch, and against the date before; `all`: of all R."""
+
+    name: str
+    net_m3: float
+    sigma_m3: float
+    since_previous_m3: float
+    sigma_since_previous_m3: float
+
+
+class DateOfChange(Product):
+    """Date of a chain, its regions, and the vertical σ of its difference to the earlier epoch.
+
+    `name` is that of the workspace, `taken_on` the days of its photographs, a dash if they have no time.
+    """
+
+    name: str
+    taken_on: str
+    sigma_v_m: float
+    regions: tuple[RegionAtDate, ...]
+
+
 class AlongNormals(Product):
     """Change along the normals of the earlier surface, at points of its cloud.
 
@@ -92,23 +120,29 @@ class Change(Product):
         shared_sigma_v_m: σ of the vertical error that both have in common.
         median_lod_m: level of detection of the cells that both have measured.
         significant_share: of all cells.
-        lowered, raised, found: sums of the found regions that lost, that gained, and of all.
+        doubtful_share: of the cells that differ significantly, those of doubtful regions, which count as no change.
+        lowered, raised, found: sums of the found regions that lost, that gained, and of all; none of doubtful ones.
+        doubtful: the largest first.
         along_normals: of the clouds, on request.
         common: what ties both epochs; None: they were solved apart.
+        by_date: volumes in the regions at each later date of a chain, in their order; empty without dates between.
     """
 
     format_version: Literal[2] = 2
     of: Literal["surface", "terrain"]
     crs: str
     cell_m: float
-    registration: Registration
+    registration: EpochShift
     shared_control_points: tuple[str, ...]
     shared_sigma_v_m: float
     median_lod_m: float
     significant_share: float
+    doubtful_share: float = 0.0
     lowered: ChangedRegion
     raised: ChangedRegion
     found: ChangedRegion
     regions: tuple[ChangedRegion, ...]
+    doubtful: tuple[DoubtfulRegion, ...] = ()
     along_normals: AlongNormals | None = None
     common: CommonDates | None = None
+    by_date: tuple[DateOfChange, ...] = ()

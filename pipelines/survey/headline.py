@@ -12,7 +12,7 @@ from pipelines.core.figures import Headline, SurfaceAccuracy
 from pipelines.core.manifest import Memo
 from pipelines.core.products import Remark, is_checked
 from pipelines.core.sentences import listed
-from pipelines.core.stages import ADJUSTMENT, BY_NAME, MODEL, PIPELINE, REPORT, SIM3, SPARSE
+from pipelines.core.stages import ADJUSTMENT, BY_NAME, MODEL, PIPELINE, REPORT, SPARSE
 from pipelines.core.staleness import is_made_from
 from pipelines.core.types import Vector3
 from pipelines.core.workspace import Workspace
@@ -43,13 +43,15 @@ def headline(
     total = triangulated.with_survey
     if total is None:
         return predicted(scene, cautions).model_copy(update={"surface": surface})
-    count = triangulated.asprs.points
+    under = triangulated.asprs.vegetated
     others = triangulated.with_survey_without_refuted
     return Headline(
         kind="measured",
         rmse_h_m=total.rmse_h_m,
         rmse_v_m=total.rmse_v_m,
-        check_points=count,
+        check_points=triangulated.asprs.points,
+        vegetated=0 if under is None else under.count,
+        beyond_class=len(set(triangulated.blunders) - set(triangulated.refuted)),
         blunders=() if others is None else triangulated.refuted,
         rmse_h_without_m=None if others is None else others.rmse_h_m,
         rmse_v_without_m=None if others is None else others.rmse_v_m,
@@ -84,8 +86,8 @@ def headline_of(workspace: Workspace, memo: Memo | None = None) -> Headline | No
 
 
 def is_evaluated(workspace: Workspace, memo: Memo | None = None) -> bool:
-    """Return whether there is an evaluation of the solution that `load_solution` returns."""
-    solution = (MODEL,) if workspace.has(MODEL) else (SIM3, ADJUSTMENT, MODEL)
+    """Return whether there is an evaluation of the solution that `read_solution` returns."""
+    solution = (MODEL,) if workspace.has(MODEL) else (ADJUSTMENT, MODEL)
     hashed = {} if memo is None else memo
     return workspace.has(REPORT) and is_made_from(workspace, BY_NAME["evaluate"], solution, hashed)
 
@@ -97,7 +99,7 @@ def with_newest_solution(workspace: Workspace, memo: Memo | None = None) -> Work
     another solution. The memo of hashes by path is extended.
     """
     memo = {} if memo is None else memo
-    for stage, made_from in {"init-sim3": (SPARSE,), "train": (SPARSE, SIM3, ADJUSTMENT)}.items():
+    for stage, made_from in {"init-sim3": (SPARSE,), "train": (SPARSE, ADJUSTMENT)}.items():
         if not is_made_from(workspace, BY_NAME[stage], made_from, memo):
             workspace = workspace.without(BY_NAME[stage])
     return workspace if is_evaluated(workspace, memo) else workspace.without(BY_NAME["evaluate"])
@@ -113,8 +115,8 @@ def outdated(workspace: Workspace, newest: Workspace) -> dict[str, tuple[Remark,
     caution = Remark(
         code="result-of-earlier-solution",
         sentence=f"{names} {'are' if many else 'is'} stale: an earlier stage has a newer result. "
-        f"The accuracy stated here is not that of {'them' if many else 'it'}. "
-        f"`georef run {(workspace.base or workspace).root}` makes {'them' if many else 'it'} again.",
+        f"The accuracy stated here is not that of {'them' if many else 'it'}.",
+        remedy=f"`georef run {(workspace.base or workspace).root}` makes {'them' if many else 'it'} again.",
     )
     return {hidden[0].name: (caution,)}
 
@@ -124,10 +126,10 @@ def predicted_headline(workspace: Workspace) -> Headline | None:
 
     A damaged product states none; `georef status` names it.
     """
-    from pipelines.survey.trained_model import load_solution
+    from pipelines.survey.solution import read_solution
 
     with contextlib.suppress(GeorefError):
-        solution = load_solution(workspace)
+        solution = read_solution(workspace)
         return None if solution.accuracy is None else predicted(solution.accuracy, solution.cautions)
     return None
 

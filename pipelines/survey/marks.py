@@ -11,9 +11,17 @@ import numpy as np
 from pipelines.core.products import Remark
 from pipelines.core.types import BoolArray, FloatArray, IntArray, rows_of
 from pipelines.geometry.cameras import bearings
-from pipelines.geometry.intersection import Intersections, Rays, UncertainCameras, intersect_rays
+from pipelines.geometry.intersection import (
+    Intersections,
+    Rays,
+    UncertainCameras,
+    across_rays,
+    intersect_rays,
+    meeting_points,
+)
 from pipelines.geometry.rolling_shutter import depths_at, in_global_shutter
 from pipelines.geometry.sparse_model import SparseModel
+from pipelines.survey.solution import Solution
 from pipelines.survey.survey import PointMarks
 
 _LEAST_MARKS = 4  # of a point: fewer cannot tell which of them is wrong
@@ -100,8 +108,7 @@ def _off_px(rays: MarkRays, sparse: SparseModel) -> FloatArray:
     """
     rotation, center = sparse.rotation_cam_from_local, sparse.cam_center_in_local
     direction = np.einsum("kji,kj->ki", rotation[rays.camera], rays.bearing_in_cam)
-    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    right = np.einsum("kij,kj->ki", across, center[rays.camera])
+    across, center_of_ray = across_rays(direction), center[rays.camera]
     per_rad = rays.sigma_px / rays.sigma_rad
     rows_of_point = [np.flatnonzero(rays.point == j) for j in np.flatnonzero(rays.marks_of_point >= _LEAST_MARKS)]
 
@@ -113,8 +120,8 @@ def _off_px(rays: MarkRays, sparse: SparseModel) -> FloatArray:
     best, scatter = [], []
     for rows in rows_of_point:
         pairs = rows[np.array(list(combinations(range(len(rows)), 2))[:_MOST_PAIRS])]
-        normal = across[pairs].sum(axis=1) + _RIDGE * np.eye(3)
-        place = np.linalg.solve(normal, right[pairs].sum(axis=1)[..., None])[..., 0]
+        both, pair_of = pairs.ravel(), np.repeat(np.arange(len(pairs)), 2)
+        place = meeting_points(pair_of, center_of_ray[both], across[both], len(pairs), ridge=_RIDGE)
         residual = residuals_px(place, rows)
         others = np.where((rows == pairs[:, :1]) | (rows == pairs[:, 1:]), np.inf, residual)
         score = np.sort(others, axis=1)[:, (len(rows) - 3) // 2]
@@ -126,8 +133,9 @@ def _off_px(rays: MarkRays, sparse: SparseModel) -> FloatArray:
         good = residual <= np.maximum(limit_px, _FAR_OFF * rays.sigma_px[rows])
         if good.all() or good.sum() < 3 or 2 * good.sum() <= len(rows):
             continue
-        place = np.linalg.solve(across[rows[good]].sum(axis=0), right[rows[good]].sum(axis=0))
-        off[rows[~good]] = residuals_px(place[None], rows[~good])[0]
+        of_good, first = rows[good], np.zeros(int(good.sum()), dtype=np.int64)
+        place = meeting_points(first, center_of_ray[of_good], across[of_good], 1)
+        off[rows[~good]] = residuals_px(place, rows[~good])[0]
     return off
 
 
@@ -207,3 +215,16 @@ def mark_angles(
     across = np.linalg.norm(np.cross(rays.bearing_in_cam, in_cam), axis=1)
     along = np.einsum("ki,ki->k", rays.bearing_in_cam, in_cam)
     return np.asarray(np.arctan2(across, along))
+
+
+# Errors of the solved cameras: rays agree within these errors and the σ of their marks.
+_CAMERA_ERRORS = RayErrors(sigma_center=0.02, sigma_attitude_rad=2e-4)
+
+
+def triangulated_points(solution: Solution, rays: MarkRays) -> FloatArray:
+    """Return the intersections (J, 3) in `geo` of the rays of each point; NaN: marks in fewer than two images."""
+    poses = solution.poses
+    met = intersect_marks(rays, poses.cam_from_model, poses.cam_center_in_model, _CAMERA_ERRORS)
+    position = met.position_in_geo.copy()  # in the frame of the cameras, `model`
+    position[rays.marks_of_point < 2] = np.nan
+    return solution.similarity.apply(position)

@@ -7,6 +7,7 @@ and the files of the test views: photograph, render and their difference side by
 import hashlib
 import logging
 import math
+import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -124,11 +125,11 @@ class ImageCache:
         if not path.exists():
             write()
         try:
-            return _mapped(path)
+            return mapped_array(path)
         except (ValueError, EOFError):  # truncated by a full disk or a power failure
             log.warning("%s is damaged and made again", path)
             write()
-            return _mapped(path)
+            return mapped_array(path)
 
     def decoded(self, index: int) -> ByteArray:
         """Return a photograph (H, W, 3) as it was taken, RGB at its full size, from its file.
@@ -138,8 +139,8 @@ class ImageCache:
         """
         return np.ascontiguousarray(_decoded(self._photographs[index])[..., ::-1])
 
-    def sampled(self, index: int, decoded: ByteArray, place: Float32Array) -> ByteArray:
-        """Return the colours (…, 3) of a decoded photograph at places (…, 2) in pixels of its pinhole.
+    def sampled(self, index: int, decoded: NDArray[Any], place: Float32Array) -> NDArray[Any]:
+        """Return the colours (…) or (…, 3) of a decoded photograph at places (…, 2) in pixels of its pinhole.
 
         The photograph is interpolated once, where reading its undistorted image would be the second time. The cache
         must be one of photographs at full size.
@@ -153,7 +154,7 @@ class ImageCache:
         if photograph.shift is not None:
             source = source + _shift_at(photograph, source)
         colours = cv2.remap(decoded, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        return np.asarray(colours, dtype=np.uint8)
+        return np.asarray(colours, dtype=decoded.dtype)
 
     def mask(self, index: int) -> BoolArray:
         """Return the mask (H, W) of the pixels that the photograph covers and that count, mapped from disk.
@@ -169,7 +170,7 @@ class ImageCache:
                 shrunken = cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
                 mask = np.asarray(shrunken, dtype=bool)
             save_array(path, mask & self._own_mask(index))
-        return _mapped(path)
+        return mapped_array(path)
 
     def is_masked(self, index: int) -> bool:
         """Return whether a photograph has a mask of its own."""
@@ -184,8 +185,9 @@ class ImageCache:
         require_unchanged(data, photograph.mask_sha256, photograph.mask)
         full = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
         if full is None or full.shape != (photograph.camera.height, photograph.camera.width):
-            message = "The mask is not that of the photograph. Run `georef ingest` again."
-            raise InputError("mask-damaged", message, path=photograph.mask)
+            message = "The mask is not that of the photograph."
+            remedy = "Run `georef ingest` again."
+            raise InputError("mask-damaged", message, path=photograph.mask, remedy=remedy)
         counts = np.where(full > 0, np.float32(1), np.float32(0))
         small = cv2.resize(counts, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
         source = self._map(index)[0]
@@ -221,8 +223,9 @@ class ImageCache:
         try:
             stat = photograph.file.stat()
         except OSError as error:
-            message = f"The photograph cannot be read ({error.strerror}). Restore it, or run `georef ingest` again."
-            raise InputError("photograph-missing", message, path=photograph.file) from error
+            message = f"The photograph cannot be read ({error.strerror})."
+            remedy = "Restore it, or run `georef ingest` again."
+            raise InputError("photograph-missing", message, path=photograph.file, remedy=remedy) from error
         camera = photograph.camera
         key = (
             f"{photograph.name}|{stat.st_size}|{stat.st_mtime_ns}|{camera.model}|{camera.width}x{camera.height}|"
@@ -373,8 +376,14 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
         np.save(handle, array, allow_pickle=False)
 
 
-def _mapped(path: Path) -> NDArray[Any]:
-    array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+# numpy reads a header by Python's parser, which some versions refuse with a SystemError in two threads at once.
+_HEADERS = threading.Lock()
+
+
+def mapped_array(path: Path) -> NDArray[Any]:
+    """Return an array that `save_array` wrote, mapped from disk."""
+    with _HEADERS:
+        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
     return array
 
 

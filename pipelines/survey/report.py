@@ -14,7 +14,7 @@ from pipelines.core.figures import Headline, ToleranceTest
 from pipelines.core.products import ImageName, Product, Remark, load_json
 from pipelines.core.types import Vector3
 from pipelines.geometry.statistics import ResidualStats
-from pipelines.survey.report_parts import ReferenceComparison, VarianceFactor
+from pipelines.survey.report_parts import HeldOutDepths, ReferenceComparison, VarianceFactor
 
 
 class _OptionalKeys(Product):
@@ -358,6 +358,7 @@ class EvaluationReport(_OptionalKeys):
     similarity: SimilaritySigma
     coordinates: Coordinates | None = None
     reference: ReferenceComparison | None = None
+    held_out: HeldOutDepths | None = None  # None: not trained with measured geometry, or none was held out
     distances: tuple[DistanceError, ...] = ()
     tolerances: tuple[ToleranceTest, ...] = ()
     variance_factors: tuple[VarianceFactor, ...] = ()
@@ -379,5 +380,6 @@ def read_report(path: Path) -> EvaluationReport:
     except InputError as error:
         if not isinstance(error.__cause__, ValueError):  # The file cannot be read: its content is not at fault.
             raise
-        message = "is not a report. Make it again with `georef evaluate --force`."
-        raise InputError("report-invalid", message, path=path, field=error.field) from error
+        message = "is not a report."
+        remedy = "Make it again with `georef evaluate --force`."
+        raise InputError("report-invalid", message, path=path, field=error.field, remedy=remedy) from error

@@ -149,7 +149,8 @@ class LidarReport(Product):
 
     Attributes:
         read, noise, withheld, overlap, outside: numbers of points read, and dropped by reason.
-        points: that remain after thinning, about `voxel_m` apart.
+        points: that remain after thinning, about `voxel_m` apart, and that the training was given.
+        held_out: number of further ones that it was not given (`lidar_held_out`).
         rejected_share: of the points, which disagree with the photographs.
         confidence: median over the points.
         areas: that have changed, the largest first.
@@ -164,12 +165,53 @@ class LidarReport(Product):
     overlap: int
     outside: int
     points: int
+    held_out: int = 0
     voxel_m: float
     registration: LidarRegistration
     rejected_share: float
     confidence: float
     areas: tuple[LidarArea, ...]
     assumptions: tuple[Remark, ...] = ()
+
+
+class DepthErrors(Product):
+    """Errors of a surface at measured points, along their normals; above zero, it lies in front of them.
+
+    Attributes:
+        points: number of points.
+        bias_m: median with sign.
+        median_m, abs_90_m: median and 90th percentile of the magnitude.
+    """
+
+    points: int
+    bias_m: float | None
+    median_m: float | None
+    abs_90_m: float | None
+
+
+class HeldOutDepths(Product):
+    """Errors of the surface at the measured points that the training was not given.
+
+    Both are of the same points: where the depth maps of the photographs and the renders both show a surface, in the
+    view that shows the point most closely.
+
+    Attributes:
+        share: of the squares of the plan that were held out.
+        points: held-out points that a training view shows.
+        changed, unseen: numbers of those that the photographs contradict, and that no training view shows.
+        known_before, known_after: numbers of points at which depth maps and renders show a surface.
+        before: of the photographs' depth maps, without measured geometry.
+        after: of the trained model.
+    """
+
+    share: float
+    points: int
+    changed: int
+    unseen: int
+    known_before: int
+    known_after: int
+    before: DepthErrors
+    after: DepthErrors
 
 
 Group = Literal[
@@ -288,7 +330,7 @@ class EstimatedError(Product):
             arm that the survey has applied, camera axes, in m. `boresight`: rotation vector from the true to the
             nominal camera axes, in degrees. `lidar-shift`: LiDAR minus its true place, east, north, up, in m.
             `earlier-date`: truth minus the places of the earlier date, east, north, up, in m.
-        observed: σ is at most half of that of the prior.
+        observed: σ is at most half of that of the prior, and of lever arm and boresight at most a tenth.
     """
 
     name: Literal["bias", "lever-arm", "boresight", "lidar-shift", "earlier-date"]

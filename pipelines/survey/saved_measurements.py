@@ -32,6 +32,7 @@ class Quantity:
 
 
 def new_id() -> str:
+    """Return a random identifier of 32 hexadecimal digits."""
     return uuid.uuid4().hex
 
 

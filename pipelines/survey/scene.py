@@ -14,8 +14,7 @@ import numpy as np
 
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.plan import photograph_folder
-from pipelines.core.products import load_json
-from pipelines.core.stages import ADJUSTMENT, MASKS, SIM3, SPARSE
+from pipelines.core.stages import ADJUSTMENT, MASKS, SPARSE
 from pipelines.core.types import Float32Array, FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
@@ -25,11 +24,11 @@ from pipelines.geometry.network import Network
 from pipelines.geometry.rolling_shutter import depths_at, in_rolling_shutter
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.adjustment import SimilarityEstimate
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.photographs import ImageCache, Photograph
+from pipelines.survey.solution import Solution, read_solution
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_model import Adjustment
 
 _SHIFT_GRID = (48, 36)  # columns and rows: tie points are not denser
 
@@ -43,6 +42,8 @@ class Scene:
     geo_from_model: Similarity  # initial estimate, a pure shift
     train: IntArray  # indices of cameras
     test: IntArray
+    # Information of the image observations where it is known from another frame; None: it is computed
+    known_bundle: BundleInformation | None = None
 
     @cached_property
     def poses(self) -> CameraPoses:
@@ -56,12 +57,16 @@ class Scene:
         """Return the scene of some cameras (K,), in ascending order, in the same frame."""
         rows = np.unique(images)
         train, test = (np.searchsorted(rows, np.intersect1d(split, rows)) for split in (self.train, self.test))
-        return replace(self, sparse=self.sparse.of_images(rows), train=train, test=test)
+        return replace(self, sparse=self.sparse.of_images(rows), train=train, test=test, known_bundle=None)
 
     @cached_property
     def point_in_model(self) -> FloatArray:
         """Points of the SfM model (N, 3), metres in `model`."""
         return self.model_from_local.apply(self.sparse.point_in_local)
+
+    def geo_from_local(self, geo_from_model: Similarity) -> Similarity:
+        """Return a similarity of the model as one of the SfM frame."""
+        return geo_from_model @ self.model_from_local
 
     @cached_property
     def network(self) -> Network:
@@ -71,12 +76,7 @@ class Scene:
     @cached_property
     def bundle(self) -> BundleInformation:
         """Information of the image observations on the cameras, which the lens follows."""
-        return bundle_information(self.network)
-
-    def with_bundle(self, bundle: BundleInformation) -> Scene:
-        same = replace(self)
-        same.__dict__["bundle"] = bundle
-        return same
+        return bundle_information(self.network) if self.known_bundle is None else self.known_bundle
 
 
 def network_of(sparse: SparseModel, poses: CameraPoses, point_in_model: FloatArray) -> Network:
@@ -110,7 +110,7 @@ def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity
     return Scene(sparse, model_from_local, Similarity(translation=shift), train, test)
 
 
-def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarity) -> Scene:
+def initial_scene(sparse: SparseModel, survey: Survey, initial: SimilarityEstimate) -> Scene:
     """Return the scene at the start of training, its origin at the median SfM point, rounded to a metre.
 
     Raises as `make_scene`.
@@ -121,7 +121,7 @@ def initial_scene(sparse: SparseModel, survey: Survey, initial: InitialSimilarit
     return make_scene(sparse, survey, model_from_local, shift)
 
 
-def adjusted_scene(sparse: SparseModel, survey: Survey, adjustment: Adjustment) -> Scene:
+def adjusted_scene(sparse: SparseModel, survey: Survey, adjustment: Solution) -> Scene:
     """Return the scene in the frame of an adjustment; `geo_from_model` is the pure shift that comes nearest to it.
 
     Raises as `make_scene`.
@@ -131,20 +131,17 @@ def adjusted_scene(sparse: SparseModel, survey: Survey, adjustment: Adjustment) 
     return make_scene(sparse, survey, model_from_local, adjustment.similarity.apply(middle) - middle)
 
 
-def load_adjusted_scene(
-    workspace: Workspace, product: str = ADJUSTMENT
-) -> tuple[InitialSimilarity, Adjustment, Survey, Scene]:
-    """Read the initial similarity, the adjustment, the survey with its variance factors, and the scene.
+def load_adjusted_scene(workspace: Workspace, product: str = ADJUSTMENT) -> tuple[Solution, Survey, Scene]:
+    """Read the adjustment, the survey with its variance factors, and the scene.
 
     `product` is the adjustment: that of `init-sim3`, or the solution that blocks share.
 
     Raises:
         GeorefError: a product does not exist, is damaged, or has too few images.
     """
-    initial = load_json(InitialSimilarity, workspace.path(SIM3))
-    survey = initial.weighted(load_survey(workspace))
-    adjustment = load_json(Adjustment, workspace.path(product))
-    return initial, adjustment, survey, adjusted_scene(read_sparse(workspace.path(SPARSE)), survey, adjustment)
+    adjustment = read_solution(workspace, product)
+    survey = adjustment.weighted(load_survey(workspace))
+    return adjustment, survey, adjusted_scene(read_sparse(workspace.path(SPARSE)), survey, adjustment)
 
 
 def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_size_px: int) -> ImageCache:
@@ -167,9 +164,9 @@ def photograph_files(sparse: SparseModel, survey: Survey, workspace: Workspace) 
     if foreign:
         raise InputError(
             "images-not-in-survey",
-            f"{len(foreign)} images of the model are not in the survey, such as {foreign[0]!r}. Import the model "
-            "with `georef sfm --import`, which leaves them out.",
+            f"{len(foreign)} images of the model are not in the survey, such as {foreign[0]!r}.",
             path=workspace.root / SPARSE,
+            remedy="Import the model with `georef sfm --import`, which leaves them out.",
         )
     folder = photograph_folder(workspace, survey.image_dir)
     shots = []

@@ -49,9 +49,13 @@ RigParameters = Annotated[
 
 
 class RigEstimate(Product):
-    """Parameter of the rig, estimated from the SfM cameras, by component; docs/formats.md explains the fields.
+    """Parameter of the rig, estimated from the SfM cameras, by component.
 
-    Sign and unit are those of the option of `ingest` with the same name, whose value was the start.
+    Sign and unit are those of the option of `ingest` with the same name, whose value was the `start`.
+
+    Attributes:
+        value, sigma: of the time offset one number, else three.
+        observable: whether the flight shows the component.
     """
 
     name: RigParameter
@@ -113,7 +117,12 @@ class FixLag(Product):
 class RigCalibration(Product):
     """Product of `calibrate`: estimates of the rig, divided into those that `load_survey` applies and the others.
 
-    docs/formats.md explains the fields.
+    Attributes:
+        wanted: any of `time-offset`, `boresight`, `lever-arm`.
+        images, control_points: how many took part.
+        rms_position_m, rms_attitude_deg: robust σ of the residuals along an axis.
+        problem, remedy: why nothing could be estimated, and what to type against it, else empty.
+        fix_lag: of positions by photograph.
     """
 
     format_version: Literal[1] = 1
@@ -125,6 +134,7 @@ class RigCalibration(Product):
     rms_position_m: float | None = None
     rms_attitude_deg: float | None = None
     problem: str = ""
+    remedy: str = ""
     fix_lag: FixLag | None = None
 
     @model_validator(mode="after")
@@ -304,6 +314,13 @@ class Companion(Product):
     stated_quat_xyzw: Rotation | None = None
 
 
+class Original(Product):
+    """Photograph as it was taken, of which the folder of the survey has a copy with fewer bits."""
+
+    name: ImageName
+    sha256: str
+
+
 class Mark(Product):
     """Image coordinates of a surveyed point: pixels of the full image, centre of the top-left pixel (0.5, 0.5)."""
 
@@ -368,6 +385,7 @@ class Survey(Product):
         sigma_datum_m: σ east, north, up that all control points share, because their CRS is tied to WGS84 no
             better; no adjustment reveals it, and all absolute σ of a result with control points include it.
         companions: photographs of the other lenses of a rig.
+        original_dir: folder of the `originals`, which have the names of their copies.
         check_points: points that enter no solution.
         assumptions: decisions that `ingest` made where the input states nothing.
         cautions: limits of every result of the survey.
@@ -386,6 +404,8 @@ class Survey(Product):
     cameras: tuple[CameraPrior, ...]
     images: tuple[SurveyImage, ...]
     companions: tuple[Companion, ...] = ()
+    original_dir: Annotated[str, AfterValidator(image_dir)] | None = None
+    originals: tuple[Original, ...] = ()
     sessions: tuple[FixSession, ...] = ()
     transformations: tuple[UsedTransformation, ...] = ()
     sigma_datum_m: Vector3 = (0.0, 0.0, 0.0)
@@ -445,8 +465,8 @@ class Survey(Product):
         if self.origin is None:
             raise InputError(
                 "not-on-earth",
-                "The survey has a local metric frame and no place on Earth, which this needs. Run `georef ingest` "
-                "with positions or control points.",
+                "The survey has a local metric frame and no place on Earth, which this needs.",
+                remedy="Run `georef ingest` with positions or control points.",
             )
         return self.origin
 

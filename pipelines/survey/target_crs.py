@@ -118,9 +118,9 @@ def target_crs(
         if options.crs is not None or options.vertical is not None:
             raise InputError(
                 "not-on-earth",
-                "The survey has a local metric frame and no place on Earth: a CRS does not apply to it. Remove "
-                "--crs and --vertical, or run `georef ingest` with positions or control points.",
+                "The survey has a local metric frame and no place on Earth: a CRS does not apply to it.",
                 field="--vertical" if options.crs is None else "--crs",
+                remedy="Remove --crs and --vertical, or run `georef ingest` with positions or control points.",
             )
         return TargetCrs(local_frame(), None, np.zeros((0, 3)))
     lla = lla_from_enu(scene_in_geo, origin).reshape(-1, 3)
@@ -130,11 +130,11 @@ def target_crs(
     crs = replace(crs, vertical=_datum_of_result(crs, options, heights))
     assumed = []
     if options.crs is None:
-        assumed.append(f"no --crs was given: the UTM zone of the scene, {text}")
+        assumed.append(f"the UTM zone of the scene, {text}, as nobody stated a CRS")
     if not crs.states_vertical and options.vertical is None:
         assumed.append(
-            f"no --vertical was given: heights are {crs.vertical.name}, the datum of the survey's input "
-            f"({heights.source})"
+            f"heights are {crs.vertical.name}, the datum of the survey's input ({heights.source}), as nobody "
+            "stated another"
         )
     elif heights.is_assumed:
         assumed.append(f"the survey's heights were assumed to be {heights.name}: nobody stated their datum")

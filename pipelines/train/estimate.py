@@ -3,7 +3,6 @@
 Default effort: by number and pixels of the photographs, within what the memory allows.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,12 +10,11 @@ import torch
 from pipelines.core.machine import thread_count
 from pipelines.core.sentences import about
 from pipelines.geometry.cameras import Pinhole
-from pipelines.jobs.calibration import machine_factor
-from pipelines.jobs.costs import ITERATION_PROCESSOR_SECONDS, MEASURED_CORES, SURFACE_FACTOR, iteration_seconds
+from pipelines.jobs.costs import BUSY_CORES, COSTS, Work, cores_factor, iteration_seconds
 from pipelines.splat.memory import USABLE, TrainingSize, fitting_gaussians, free_memory_bytes, predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.surface.depth_maps import FINE
-from pipelines.survey.block_plan import BlockPlan, PlannedBlock
+from pipelines.survey.block_plan import BlockPlan
 from pipelines.survey.options import NOT_IN_BLOCKS
 from pipelines.train.options import PRESETS, TrainOptions, surveys_of
 from pipelines.train.schedule import COARSE, pyramid
@@ -55,11 +53,6 @@ def with_effort(options: TrainOptions, photographs: int, largest: Pinhole, free_
         size = replace(training_size(options, photographs, largest), gaussians=min(limits))
         limits.append(fitting_gaussians(size, free_bytes))
     return options.model_copy(update={"max_gaussians": max(preset.max_gaussians, min(limits))})
-
-
-# Stereo, by photographs (sweep and middle pixels have one size) and by megapixels of the depth maps: of 42 views in
-# 10 s, and of 875 in 230 s, on 2 cores of an AMD EPYC without AVX-512, 2026-11-26.
-_STEREO_PHOTOGRAPH_S, _STEREO_MEGAPIXEL_S = 0.13, 0.3
 
 
 @dataclass(frozen=True)
@@ -119,12 +112,14 @@ class TrainingEstimate:
 def estimate_training(photographs: int, photo_px: tuple[int, int], options: TrainOptions) -> TrainingEstimate:
     """Return the estimate of a training; a BackendUnavailableError names each missing part of `--backend cuda`.
 
-    The time is that of the machine of `MEASURED_ON`, times the factor of this machine.
+    The time is that of the machine of `MEASURED_ON`, with the cores of this one.
     """
     camera, backend = training_pinhole(photo_px, options), chosen_backend(options.backend)
     free_bytes = free_memory_bytes(torch.device(backend))
     options = with_effort(options, photographs, camera, free_bytes)
     effort, size = options.effort, training_size(options, photographs, camera)
+    pixels = camera.width * camera.height
+    seconds = cores_factor() * _seconds(options, camera, photographs, pixels=pixels, gaussians=effort.max_gaussians)
     return TrainingEstimate(
         preset=options.preset,
         photographs=photographs,
@@ -135,7 +130,7 @@ def estimate_training(photographs: int, photo_px: tuple[int, int], options: Trai
         max_gaussians=effort.max_gaussians,
         backend=backend,
         threads=thread_count(),
-        seconds=_seconds(photographs, camera, options) if backend == "cpu" else None,
+        seconds=seconds if backend == "cpu" else None,
         peak_bytes=predicted_peak_bytes(size),
         free_bytes=free_bytes,
         blocks=options.blocks,
@@ -145,18 +140,19 @@ def estimate_training(photographs: int, photo_px: tuple[int, int], options: Trai
 
 def block_processor_s(plan: BlockPlan, photo_px: tuple[int, int], options: TrainOptions) -> dict[int, float]:
     """Return the processor seconds that the CPU backend needs for each block of a plan, by number, on one core."""
-    seconds, camera = {}, training_pinhole(photo_px, options)
-    factor = SURFACE_FACTOR if options.geometry_regularisation else 1.0
-    for block in plan.blocks:
-
-        def one(pixels: float, crops: int, block: PlannedBlock = block) -> float:
-            count = block.gaussians + plan.scaffold_gaussians
-            return factor * ITERATION_PROCESSOR_SECONDS.of(pixels / crops, block.visible / crops, count)
-
-        iterating = _of_all_iterations(camera, block.view_px, options, one)
-        stereo = MEASURED_CORES * _stereo_s(len(block.cameras), camera)
-        seconds[block.id] = iterating + (stereo if options.dense else 0.0)
-    return seconds
+    camera = training_pinhole(photo_px, options)
+    return {
+        block.id: BUSY_CORES
+        * _seconds(
+            options,
+            camera,
+            len(block.cameras),
+            pixels=block.view_px,
+            gaussians=block.gaussians + plan.scaffold_gaussians,
+            visible=block.visible,
+        )
+        for block in plan.blocks
+    }
 
 
 def training_pinhole(photo_px: tuple[int, int], options: TrainOptions) -> Pinhole:
@@ -166,36 +162,34 @@ def training_pinhole(photo_px: tuple[int, int], options: TrainOptions) -> Pinhol
     return whole.limited(options.effort.max_image_size)
 
 
-def _of_all_iterations(
-    camera: Pinhole, pixels: float, options: TrainOptions, one: Callable[[float, int], float]
+def _seconds(
+    options: TrainOptions,
+    camera: Pinhole,
+    photographs: int,
+    *,
+    pixels: float,
+    gaussians: int,
+    visible: float | None = None,
 ) -> float:
-    """Return the seconds of all iterations on photographs with so many pixels that count.
+    """Return the seconds of stereo and of all iterations on the machine of `MEASURED_ON`.
 
-    `one` returns those of an iteration, by the pixels of a shrunken photograph and its crops.
+    Pixels are those that count of a photograph at its whole size, visible Gaussians those in it (None: unknown).
     """
-    seconds, begun = 0.0, 0.0
+    seconds, begun, surface = 0.0, 0.0, options.geometry_regularisation
     coarse, crops = COARSE if options.coarse_to_fine else (), Crops(options.crop_size)
     for shrink, until in pyramid(camera.width, camera.height, coarse, crops):
         side = (pixels / (camera.width * camera.height)) ** 0.5 / shrink
         parts = crops.count(max(int(side * camera.width), 1), max(int(side * camera.height), 1))
-        seconds += (until - begun) * options.effort.iterations * one(pixels / shrink**2, parts)
+        seconds += (
+            (until - begun)
+            * options.effort.iterations
+            * iteration_seconds(
+                pixels / shrink**2, gaussians, photographs, surface=surface, crops=parts, visible=visible
+            )
+        )
         begun = until
-    return seconds
-
-
-def _seconds(photographs: int, camera: Pinhole, options: TrainOptions) -> float:
-    """Return the seconds of stereo and of all iterations on this machine."""
-
-    def one(pixels: float, crops: int) -> float:
-        surface, count = options.geometry_regularisation, options.effort.max_gaussians
-        return iteration_seconds(pixels, count, photographs, surface=surface, crops=crops)
-
-    seconds = _of_all_iterations(camera, camera.width * camera.height, options, one)
-    if options.dense:
-        seconds += _stereo_s(photographs, camera)
-    return seconds * machine_factor()
-
-
-def _stereo_s(photographs: int, camera: Pinhole) -> float:
+    if not options.dense:
+        return seconds
     maps = camera.limited(FINE.longest_px)
-    return photographs * (_STEREO_PHOTOGRAPH_S + _STEREO_MEGAPIXEL_S * maps.width * maps.height / 1e6)
+    megapixels = photographs * maps.width * maps.height / 1e6
+    return seconds + COSTS["stereo"].of(Work(photographs=photographs, megapixels=megapixels))

@@ -16,7 +16,7 @@ from scipy import ndimage
 from pipelines.adjust.terms import Planes
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.progress import Progress
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, rows_of
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.similarity import Similarity, SimilarityRecord, covariance_at
 from pipelines.geometry.statistics import mad_sigma
@@ -29,9 +29,11 @@ from pipelines.surface.measured_cloud import MeasuredFiles
 from pipelines.surface.photo_depths import PhotoDepths
 from pipelines.surface.registration import Registration, registration
 from pipelines.surface.visibility import DepthViews, Viewpoints
+from pipelines.survey.held_out import HeldOutPoints
 from pipelines.survey.report_parts import LidarArea, LidarRegistration, LidarReport
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
+from pipelines.train.held_out import held_out_points
 from pipelines.train.lidar_surface import CloudVerdict, FusedSurface, verdict
 from pipelines.train.options import LidarOptions
 from pipelines.train.surface import SceneSurface
@@ -65,6 +67,7 @@ class ComparedLidar:
     """Cloud of the scene, in `model`, compared with the photographs and not moved."""
 
     cloud: LidarCloud
+    held: LidarCloud | None  # points that the training is not given; None: none
     maps: DepthMaps  # depth maps of the training views
     views: DepthViews  # the same as one set
     shown: FloatArray  # (S, 3) surface that they show
@@ -81,6 +84,7 @@ class LidarSurface:
     report: LidarReport
     verdict: CloudVerdict
     cloud: LidarCloud
+    held_out: HeldOutPoints | None = None
 
 
 def compared_lidar(
@@ -101,23 +105,40 @@ def compared_lidar(
     if isinstance(files, PhotoDepths):
         files.check(maps)
     pixel_m, views, surface = _pixel_size_m(maps), _depth_views(maps), SceneSurface(maps)
-    cloud = read_cloud(files, maps.scene, survey, pixel_m, progress=progress, track=track)
+    cloud, held = read_cloud(
+        files, maps.scene, survey, pixel_m, progress=progress, track=track, held_out=options.lidar_held_out
+    )
     shown = np.concatenate([surface.points(index, _STRIDE) for index in map(int, maps.scene.train)])
     found = registration_of(cloud, shown, views, seed, depths=isinstance(files, PhotoDepths))
     record = _checked(found, cloud, maps.scene, georeference, options)
-    return ComparedLidar(cloud, maps, views, shown, pixel_m, found, record)
+    return ComparedLidar(cloud, held, maps, views, shown, pixel_m, found, record)
 
 
 def lidar_surface(
     compared: ComparedLidar, files: MeasuredFiles, survey: Survey, options: LidarOptions, shift_m: FloatArray | None
 ) -> LidarSurface:
     """Return the surface of stereo and LiDAR, without a shift (3,) of the LiDAR, axes of geo; None: none."""
-    cloud = compared.cloud if shift_m is None else compared.cloud.moved(-shift_m)
-    judged = verdict(cloud, compared.views, compared.shown, sigma_m=options.lidar_sigma, pixel_m=compared.pixel_m)
+    shift = np.zeros(3) if shift_m is None else shift_m
+
+    def judgement(points: LidarCloud) -> CloudVerdict:
+        return verdict(
+            points, compared.views, compared.shown, sigma_m=options.lidar_sigma, pixel_m=compared.pixel_m
+        )
+
+    cloud = compared.cloud.moved(-shift)
+    judged, kept_free, held_out = judgement(cloud), compared.shown, None
+    if compared.held is not None:
+        held = compared.held.moved(-shift)
+        gone = judgement(held).rejected
+        held_out = held_out_points(
+            held, gone, rows_of(cloud, ~judged.rejected), compared.maps, options.lidar_held_out
+        )
+        kept_free = np.concatenate([compared.shown, held.position_in_model])
     report = LidarReport(
         **asdict(files.tally),
         crs=files.crs_names,
         points=len(cloud),
+        held_out=0 if compared.held is None else len(compared.held),
         voxel_m=cloud.voxel_m,
         registration=compared.record,
         rejected_share=float(judged.rejected.mean()),
@@ -125,9 +146,9 @@ def lidar_surface(
         areas=_listed_areas(judged, compared.maps.scene, survey),
         assumptions=files.assumptions,
     )
-    free = free_space(cloud, judged.rejected, compared.shown)
+    free = free_space(cloud, judged.rejected, kept_free)
     surface = FusedSurface(compared.maps, cloud, judged, compared.pixel_m, loss=options.lidar_loss, free=free)
-    return LidarSurface(surface, report, judged, cloud)
+    return LidarSurface(surface, report, judged, cloud, held_out)
 
 
 def draw_changes(path: Path, lidar: LidarSurface, scene: Scene) -> None:
@@ -208,14 +229,15 @@ def plane_observations(found: Registration, geo_from_model: Similarity) -> Plane
         point_in_model=measured + off[:, None] * normal,
         position_in_geo=geo_from_model.apply(measured + found.shift_m),
         normal_in_geo=normal,
-        root_information=np.full((len(middle), 1, 1), 1.0 / sigma_m),
+        cov=np.full((len(middle), 1, 1), sigma_m**2),
     )
 
 
 def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpace | None:
     """Return the cells that beams have crossed and in which nothing is seen; None: no beam is known.
 
-    Beams of points (P,) that are `gone` do not count. Where the photographs show a surface (S, 3), nothing is free.
+    Beams of points (P,) that are `gone` do not count. Where the photographs show a surface (S, 3), nothing is free;
+    nor is anything where points are held out.
     """
     if cloud.scanner_in_model is None:
         return None

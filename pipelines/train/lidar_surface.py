@@ -201,6 +201,12 @@ class LidarPlanes:
         return moved, normal, confidence
 
 
+def surfels_of(cloud: LidarCloud) -> Surfels:
+    """Return discs at the points of a cloud that leave no gap between neighbours."""
+    radius_m = np.clip(_GAP * cloud.reach_m, _LEAST_GAP * cloud.voxel_m, _MOST_GAP * cloud.voxel_m)
+    return Surfels(cloud.position_in_model, cloud.normal_in_model, radius_m)
+
+
 class FusedSurface(SceneSurface):
     """Surface of stereo, corrected by registered LiDAR, and continued by it where stereo found none.
 
@@ -227,8 +233,7 @@ class FusedSurface(SceneSurface):
         # All points hide what lies behind them, those that training does not trust too, but none that are gone.
         standing = np.flatnonzero(~judged.rejected)
         self._cloud, self._confidence = rows_of(cloud, standing), judged.confidence[standing]
-        radius_m = np.clip(_GAP * self._cloud.reach_m, _LEAST_GAP * cloud.voxel_m, _MOST_GAP * cloud.voxel_m)
-        self._surfels = Surfels(self._cloud.position_in_model, self._cloud.normal_in_model, radius_m)
+        self._surfels = surfels_of(self._cloud)
 
     def depth_loss_points(self, index: int, stride: int) -> tuple[FloatArray, Float32Array]:
         """Return the points (P, 3) of a training view's depth loss, and the weight of each (P,)."""

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -110,7 +111,7 @@ class _Loop:
         """Return the duration so far, with the runs before a resume."""
         return self._spent + time.monotonic() - self._clock
 
-    def iterate(self) -> dict[str, float] | None:
+    def iterate(self) -> dict[str, Any] | None:
         """Run one iteration, check and save where due, and return the row of metrics if one was due."""
         trainer, options = self.trainer, self.options
         report = trainer.step()
@@ -163,11 +164,13 @@ class _Loop:
         return float(state["seconds"])
 
 
-def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> dict[str, float]:
+# Motion of the whole since the start of training, in `model`: without unit, radians, metres.
+_MOTION = ("ln_scale", "turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z")
+
+
+def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> dict[str, Any]:
     problem = trainer.problem
-    with torch.no_grad():
-        losses, factors = problem.losses(), problem.weights.variance_factors()
-    row = {
+    row: dict[str, Any] = {
         "iteration": trainer.iteration,
         "seconds": round(seconds, 2),
         "photometric": float(report.losses["photometric"]),
@@ -177,10 +180,14 @@ def _metrics_row(trainer: JointTrainer, report: StepReport, seconds: float) -> d
         "pixels": report.pixels,
         "geo_weight": report.weight,
     }
+    if not problem.unknowns.w.numel():  # frozen
+        return row
+    with torch.no_grad():
+        losses, moved = problem.losses(), problem.unknowns.common_motion()
     row |= {name: float(value) for name, value in losses.items()}
     if "control_by_depth" in report.losses:
         row["control_by_depth"] = float(report.losses["control_by_depth"])
-    return row | {f"variance_{name}": factors[name] for name in factors}
+    return row | dict(zip(_MOTION, moved.tolist(), strict=True))
 
 
 def train_in_folder(stage: StageRun, trainer: JointTrainer, options: TrainOptions, done: int = 0) -> TrainingRecord:

@@ -1,7 +1,7 @@
 """Losses of a training: a list of records, of which each iteration differentiates the weighted sum.
 
 A loss is a function of one rendered view. `training_losses` is the list; the functions themselves are in
-`splat.losses`, `splat.surface` and `train.geographic`. The order of the list is the order in which gradients are
+`splat.losses`, `splat.surface` and `train.georeference`. The order of the list is the order in which gradients are
 added up: another order gives other last digits.
 """
 
@@ -16,7 +16,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.losses import TRANSPARENCY_WEIGHT, photometric_loss, transparency_loss
 from pipelines.splat.rasterizer.api import Render, ScreenStats
 from pipelines.splat.surface import ObservedPoints, compactness_loss, depth_loss, flatness_loss, normal_loss
-from pipelines.train.geographic.problem import GeoProblem
+from pipelines.train.georeference.problem import GeoProblem
 from pipelines.train.schedule import TrainingSchedule
 from pipelines.train.target_images import TargetImage
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from pipelines.core.errors import InputError
-from pipelines.core.options import WRITTEN, InputPath, StageOptions, flag_name, from_text
+from pipelines.core.options import HIDDEN, WRITTEN, InputPath, StageOptions, flag_name, from_text
 from pipelines.geodesy.vertical import Vertical
 from pipelines.splat.rasterizer.choice import Backend
 from pipelines.survey.options import AreaOptions, MapOffset, MeasuredPath, UpAxis
@@ -43,7 +43,7 @@ def surveys_of(photographs: int) -> float:
 
 
 # Of `georef run` with 48 photographs of a megapixel, kernels compiled, on 2 idle cores of an AMD EPYC
-# (docs/benchmarks.md, Presets).
+# (examples/benchmarks/results/training.md, Presets).
 RUN_MINUTES = {"smoke": 1, "fast": 2, "standard": 4, "high": 10}
 
 
@@ -127,6 +127,13 @@ class LidarOptions(StageOptions):
         description="Losses of the LiDAR: on rendered depth, on distances of Gaussians from its planes, or both.",
     )
     lidar_register: bool = Field(False, description="Estimate a shift of the LiDAR and remove it.")
+    lidar_held_out: float = Field(
+        0.05,
+        ge=0,
+        le=0.5,
+        description="Share of the LiDAR that is held out of the training, in whole squares of the plan, always the "
+        "same: by it `georef evaluate` measures the surface. 0: none.",
+    )
     depth_unit: DepthUnit | None = Field(
         None,
         description="Unit of depth maps, which need it: m, cm, mm, ft, or the metres of a value of 1, such as "
@@ -163,74 +170,33 @@ class LidarOptions(StageOptions):
             raise InputError("depth-unit-unknown", message, path=self.lidar, field="--depth-unit")
 
 
-# A dense basis of more cameras takes more than 2 GiB (`geometry.bundle.correction_basis`).
-MOST_JOINT_CAMERAS = 1300
-Solve = Literal["auto", "joint", "once"]
-
-
 class GeographicOptions(StageOptions):
-    """Options of the geographic losses: measurements in use, and their weights."""
+    """Options of the geographic losses."""
 
-    geo_loss: bool = Field(
-        True, description="Use the geographic losses; without them, similarity and cameras are frozen."
+    georeference: Literal["frozen", "joint", "paper"] = Field(
+        "frozen",
+        description="Similarity and cameras: frozen at the solution of init-sim3; refined with the Gaussians and "
+        "held to that solution by its covariance; or refined with the plain mean squares of the paper.",
     )
-    geo_weighting: Literal["whitened", "paper"] = Field(
-        "whitened",
-        description="Geographic losses: residuals divided by their σ, or plain mean squares as in the paper.",
-    )
-    gcp_loss: bool = Field(True, description="Use the loss of the control points, L_gcp.")
     gcp_mode: Literal["triangulated", "depth"] = Field(
         "triangulated",
         description="Position of control points: triangulated from marks, or from the rendered depth.",
     )
-    distance_loss: bool = Field(True, description="Use the loss of distances between pairs of points, L_rel.")
-    variance_factors: Literal["fixed", "learned"] = Field(
-        "fixed",
-        description="Geographic losses are weighted by the stated σ, or by variance factors that are learned.",
+    gcp_loss: Annotated[bool, HIDDEN] = Field(True, description="Use the control points.")
+    distance_loss: Annotated[bool, HIDDEN] = Field(
+        True, description="Use the loss of distances between pairs of points, L_rel."
     )
-    optimize_cameras: bool = Field(
-        True,
-        description="Refine similarity, cameras and, with --geo-weighting whitened, the lens during training; else "
-        "they stay as adjusted by init-sim3.",
-    )
-    solve_cameras: Solve = Field(
-        "auto",
-        description="Refine similarity and cameras jointly with the Gaussians, or freeze them as solved once by "
-        f"init-sim3; auto: once beyond {MOST_JOINT_CAMERAS} photographs.",
-    )
-
-    def solves_once(self, cameras: int) -> bool:
-        """Return whether a training of that many cameras freezes what init-sim3 has solved."""
-        wanted = self.solve_cameras == "once" or (self.solve_cameras == "auto" and cameras > MOST_JOINT_CAMERAS)
-        return wanted and self.optimize_cameras and self.geo_loss
 
     def refined_cameras(self, cameras: int) -> int:
         """Return how many of that many cameras are refined together with the Gaussians: all or none."""
-        return cameras if self.optimize_cameras and self.geo_loss and not self.solves_once(cameras) else 0
-
-    def require_trainable(self, cameras: int) -> None:
-        """Refuse options that change the cameras' solution while a training freezes it, by an `InputError`."""
-        if not self.solves_once(cameras):
-            return
-        for value, plain, name in (
-            (self.geo_weighting, "whitened", "--geo-weighting"),
-            (self.variance_factors, "fixed", "--variance-factors"),
-            (self.gcp_mode, "triangulated", "--gcp-mode"),
-        ):
-            if value != plain:
-                raise InputError(
-                    "cameras-solved-once",
-                    f"{value!r} changes the cameras during training, but {cameras} photographs are solved once, by "
-                    f"init-sim3: use {name} {plain}, --solve-cameras joint or --no-optimize-cameras.",
-                    field=name,
-                )
+        return 0 if self.georeference == "frozen" else cameras
 
 
 class LossOptions(StageOptions):
     """Weights of the losses that the user decides."""
 
     geo_weight: float = Field(0.05, gt=0, description="Final weight of the geographic losses (w_max of eq. 27).")
-    geo_schedule: Literal["rising", "constant"] = Field(
+    geo_schedule: Annotated[Literal["rising", "constant"], HIDDEN] = Field(
         "rising", description="Weight of the geographic losses: rising as in eq. 27, or constant."
     )
 
@@ -312,11 +278,34 @@ class PlanOptions(BlockOptions):
 
 
 class TrainOptions(LossOptions, GeographicOptions, GaussianOptions, BlockOptions, LidarOptions, AreaOptions):
-    """Options of the joint optimisation of Gaussians, similarity and camera corrections."""
+    """Options of the training of Gaussians, and on request of similarity and cameras with them.
+
+    Interrupted with Ctrl-C, training writes a checkpoint, and the next `georef train` goes on from there. Options
+    that would drop an interrupted training are refused without --force. A finished training is extended by more
+    --iterations.
+
+    A survey that does not fit into memory, or with --blocks, is trained in blocks: processes of their own, as many
+    at a time as memory and cores allow, or on the workers of --cluster. Finished blocks are kept, and their models
+    become one. `--part plan` only divides the survey, and shows the blocks.
+
+    Examples:
+      georef train flight --preset fast
+      georef train flight --resume
+      georef train flight --iterations 4000
+      georef train flight --iterations 5000 --max-image-size 800 --backend cpu
+      georef train town --part plan --preset high --max-gaussians 20000000 --block-memory 16
+      georef train town --blocks 16 --cluster tls://10.0.0.1:8786 --certificates certificates
+    """
 
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
     log_every: int = Field(10, ge=1, description="Iterations between lines of metrics.jsonl.")
     seed: int = Field(0, ge=0, description="Seed of every random choice.")
+
+    @model_validator(mode="after")
+    def _depth_needs_cameras_that_move(self) -> TrainOptions:
+        if self.gcp_mode == "depth" and self.georeference == "frozen":
+            raise ValueError("--gcp-mode depth moves the cameras: it needs --georeference joint or paper")
+        return self
 
     @model_validator(mode="after")
     def _lidar_needs_a_surface(self) -> TrainOptions:

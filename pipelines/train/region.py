@@ -16,12 +16,13 @@ import torch
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole, pose_matrix
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Window
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.block_plan import BlockCell
 from pipelines.survey.photographs import ImageCache, Pinholes
-from pipelines.train.adjusted_scene import AdjustedScene
+from pipelines.survey.solution import Solution
 
 _STAND_IN_PX = 160  # longest side of the stand-in's renders
 _LEAST_ALPHA = 0.5  # of a surface: rays that meet less end in the sky
@@ -97,22 +98,23 @@ class TrainingRegion:
 
 
 def region_masks(
-    solved: AdjustedScene,
+    solution: Solution,
+    sparse: SparseModel,
     views: IntArray,
     images: ImageCache,
     rasterizer: Rasterizer,
-    cell: BlockCell,
     *,
+    cell: BlockCell,
     stand_in: Gaussians,
     maps: DepthMaps | None = None,
     progress: Progress = SILENT,
 ) -> RegionMasks:
     """Return the pixels of the views (T,) of cameras whose surface lies in a region, the cell.
 
-    The depth of the stand-in counts where the maps, if there are any, know none.
+    `sparse` has the lenses of SfM. The depth of the stand-in counts where the maps, if there are any, know none.
     """
-    sparse, poses = solved.scene.sparse, solved.adjustment.poses
-    pinholes = Pinholes(images, sparse.lenses, solved.adjustment.with_lenses(sparse).lenses)
+    poses = solution.poses
+    pinholes = Pinholes(images, sparse.lenses, solution.with_lenses(sparse).lenses)
     masks: dict[int, BoolArray] = {}
     with progress.task("masks", len(views)) as task:
         for index in views.tolist():

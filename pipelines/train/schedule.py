@@ -28,10 +28,8 @@ class JointOptions:
     iterations: int
     sh_degree: int = 3  # that the spherical harmonics reach
     losses: LossOptions = field(default_factory=LossOptions)  # weights that the user decides
-    # first learning rate of the similarity and of systematic errors of the measurements, in standard deviations an
-    # iteration
-    similarity_rate: float = 0.1
-    camera_rate: float = 0.01  # first learning rate of the camera corrections, in standard deviations an iteration
+    # first learning rate of similarity, cameras, lens and systematic errors, in standard deviations an iteration
+    solution_rate: float = 0.01
     seed: int = 0  # of the order of views
     coarse: tuple[tuple[int, float], ...] = ()  # (factor, fraction of the training that sees them shrunken)
     coarse_least_px: int = 160  # lower limit of the longest side of a shrunken photograph

@@ -10,16 +10,15 @@ is extended from its last checkpoint.
 import json
 import logging
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipelines.adjust.posterior import Posterior, save_posterior
+from pipelines.adjust.posterior import Posterior, load_posterior, save_posterior
 from pipelines.adjust.system import minimise
-from pipelines.core.products import Remark, load_json, save_json
-from pipelines.core.stages import LIDAR, LIDAR_MAP, MODEL, POINTS, SIM3_POSTERIOR, TRAIN_POSTERIOR
+from pipelines.core.products import Remark, load_json, save_json, save_npz
+from pipelines.core.stages import HELD_OUT, LIDAR, LIDAR_MAP, MODEL, POINTS, SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.types import vector3
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.splat.exposure import Exposures
@@ -37,17 +36,24 @@ from pipelines.survey.calibrated import load_survey
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.report_parts import EstimatedError, LidarReport
-from pipelines.survey.scene import Scene, photographs
-from pipelines.survey.trained_model import Adjustment, LensVignetting, TrainedModel
-from pipelines.train.adjusted_scene import AdjustedScene, figures_of, with_exposures
+from pipelines.survey.scene import Scene, load_adjusted_scene, photographs
+from pipelines.survey.solution import LensVignetting, Solution, TrainedModel
 from pipelines.train.compilation import compile_kernels
 from pipelines.train.estimate import estimate_training, training_size, with_effort
-from pipelines.train.geographic.problem import frozen_problem, refining_problem
+from pipelines.train.georeference.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.lidar import compared_lidar, draw_changes, lidar_surface, plane_observations
 from pipelines.train.loop import METRICS, TrainingRecord, train_in_folder
 from pipelines.train.options import TrainOptions
 from pipelines.train.schedule import BACKGROUND
+from pipelines.train.solution_state import (
+    error_estimates,
+    figures_of,
+    measured_problem,
+    solved_at,
+    state_of,
+    with_exposures,
+)
 from pipelines.train.surface import SceneSurface
 from pipelines.train.trainer import JointTrainer, make_trainer
 
@@ -55,9 +61,9 @@ log = logging.getLogger(__name__)
 
 _EVIDENT_SIGMAS = 3.0
 _CAUSES = {
-    "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body",
-    "boresight": "`georef ingest --boresight` can apply it",
-    "lidar-shift": "Check the LiDAR's CRS, datum and flight",
+    "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body.",
+    "boresight": "`georef ingest --boresight` can apply it.",
+    "lidar-shift": "Check the LiDAR's CRS, datum and flight.",
 }
 
 
@@ -74,11 +80,9 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     # First, so that `--backend cuda` without a GPU fails at once.
     backend = rasterizer(options.backend, stage.progress, mip_filter=options.mip_filter)
     workspace = stage.workspace
-    adjusted, path = AdjustedScene.load(workspace), options.lidar_trajectory
-    survey, scene = adjusted.survey, adjusted.scene
+    (solution, survey, scene), path = load_adjusted_scene(workspace), options.lidar_trajectory
     clouds = measured_files(options, scene)
     track = None if path is None else ScannerTrack.read(path, _stated_crs(options), survey.origin_on_earth)
-    options.require_trainable(len(scene.sparse.image_name))
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     options = _within_memory(options, images, free_memory_bytes(backend.device))
     images.build(stage.progress)
@@ -91,36 +95,39 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         if clouds is not None:
             compared = compared_lidar(
                 options, clouds, maps, survey, track=track,
-                georeference=adjusted.adjustment.geo_from_model, seed=options.seed, progress=stage.progress,
+                georeference=solution.geo_from_model, seed=options.seed, progress=stage.progress,
             )  # fmt: skip
     if compared is not None and options.lidar_register:
         planes = plane_observations(compared.registration, scene.geo_from_model)
-    measured = adjusted.measured(control_points=options.gcp_loss, planes=planes)
+    measured = measured_problem(solution, survey, scene, control_points=options.gcp_loss, planes=planes)
     posterior: Posterior | None = None
     if planes is not None:
-        posterior = adjusted.posterior(measured, minimise(measured, adjusted.state(measured.errors)).state)
-        adjusted = replace(adjusted, adjustment=posterior.solution)
+        minimum = minimise(measured, state_of(solution, scene, measured.errors))
+        posterior = solved_at(solution, survey, scene, measured, minimum.state)
+        solution = posterior.solution
     refines = options.refined_cameras(len(images)) > 0
     if refines:
-        adjusted.require_determined(measured)
+        start = posterior or load_posterior(workspace.path(SIM3_POSTERIOR), solution, scene.sparse)
         points = GeolocatedPoints.load(workspace.path(POINTS))
-        problem = refining_problem(adjusted, measured, options, points, options.seed)
+        problem = refining_problem(start, survey, scene, measured, options, points=points, seed=options.seed)
     else:
         log.info("Similarity and cameras are frozen at the adjustment of init-sim3.")
-        problem = frozen_problem(adjusted)
+        problem = frozen_problem(solution, scene)
     if compared is not None and clouds is not None:
-        shift_m = measured.errors.value(adjusted.error_estimates(measured.errors)[0], "lidar-shift")
+        shift_m = measured.errors.value(error_estimates(solution, measured.errors)[0], "lidar-shift")
         lidar = lidar_surface(compared, clouds, survey, options, shift_m)
         surface = lidar.surface
         save_json(lidar.report, stage.out / Path(LIDAR).name)
         draw_changes(stage.out / Path(LIDAR_MAP).name, lidar, scene)
+        if lidar.held_out is not None:
+            save_npz(stage.out / Path(HELD_OUT).name, vars(lidar.held_out))
     area = boundary_area(options, scene.geo_from_model.apply(scene.point_in_model), survey.origin)
     trainer = make_trainer(TrainingScene(scene, images, surface, area=area), problem, backend, options)
     done = 0 if stage.extends is None else load_json(TrainedModel, stage.extends / Path(MODEL).name).iterations
     record = train_in_folder(stage, trainer, options, done)
     if refines:
-        posterior = adjusted.posterior(measured, problem.state())
-    model = _write_solution(stage, trainer, adjusted.adjustment, posterior)
+        posterior = solved_at(solution, survey, scene, measured, problem.unknowns.state())
+    model = _write_solution(stage, trainer, solution, posterior)
     metrics = [json.loads(row) for row in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
     return _summary(model, metrics, record, None if lidar is None else lidar.report)
 
@@ -150,7 +157,7 @@ def _within_memory(options: TrainOptions, images: ImageCache, free_bytes: int | 
 
 
 def _write_solution(
-    stage: StageRun, trainer: JointTrainer, frozen: Adjustment, posterior: Posterior | None
+    stage: StageRun, trainer: JointTrainer, frozen: Solution, posterior: Posterior | None
 ) -> TrainedModel:
     """Write and return the product of a training, of which `frozen` is the adjustment if there is no posterior."""
     model = trained_model(trainer, frozen if posterior is None else posterior.solution)
@@ -165,7 +172,7 @@ def _write_solution(
     return model
 
 
-def trained_model(trainer: JointTrainer, solution: Adjustment) -> TrainedModel:
+def trained_model(trainer: JointTrainer, solution: Solution) -> TrainedModel:
     """Return the product of `train` without the Gaussians, given the solution at the end of the training."""
     vignetting: tuple[LensVignetting, ...] = ()
     if trainer.exposures is not None:
@@ -231,8 +238,8 @@ def _warning_of(error: EstimatedError) -> Remark | None:
         for value, sigma, observed in zip(error.value, error.sigma, error.observed, strict=True)
     ]
     if any(evident):
-        evidence = f"The {error.name} of ({values}) {error.unit} {axes} exceeds 3 σ and was removed"
-        return Remark(code=f"{error.name}-estimated", sentence=f"{evidence}. {_CAUSES[error.name]}")
+        evidence = f"The {error.name} of ({values}) {error.unit} {axes} exceeds 3 σ and was removed."
+        return Remark(code=f"{error.name}-estimated", sentence=evidence, remedy=_CAUSES[error.name])
     if not all(error.observed):
         sentence = f"The {error.name} is not observable along every axis: ({values}) {error.unit} {axes}."
         return Remark(code=f"{error.name}-not-observable", sentence=sentence)

@@ -37,7 +37,7 @@ from pipelines.splat.outlier_pixels import OutlierPixels, OutlierSettings
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Render, ScreenStats
 from pipelines.splat.surface import ObservedPoints
 from pipelines.survey.photographs import ImageCache, Pinholes
-from pipelines.train.geographic.problem import GeographicAdam, GeoProblem
+from pipelines.train.georeference.problem import GeographicAdam, GeoProblem
 from pipelines.train.initial_gaussians import TrainingScene, depth_loss_points, initial_gaussians
 from pipelines.train.lidar_surface import FusedSurface
 from pipelines.train.losses import Loss, RenderedView, training_losses, weighted_sum
@@ -115,7 +115,7 @@ class JointTrainer:
         self.schedule = TrainingSchedule(options, views.camera)
         self.device = optimizer.gaussians.means.device
         self.pinholes = Pinholes(views.images, views.lenses)
-        self._lens = np.zeros(len(problem.cameras.lens()))
+        self._lens = np.zeros(len(problem.unknowns.lens()))
         masks = None if region is None else region.masks
         self._targets = TargetImages(views.images, self.pinholes, self.device, masks, options.crops)
         self._losses = training_losses(
@@ -134,20 +134,22 @@ class JointTrainer:
         """Run one iteration and return its figures.
 
         1. One training view, or a window of it, is rendered and compared with its photograph.
-        2. The gradient of all losses moves Gaussians, similarity, cameras, systematic errors, weights, exposures.
+        2. The gradient of all losses moves Gaussians, similarity, cameras, systematic errors, exposures.
         3. Density control records the render, and edits the Gaussians if its schedule says so.
         """
         self.iteration += 1
         if self.iteration % _LENS_EVERY == 1:
-            self._look_through(self.problem.cameras.lens().detach().cpu().numpy())
-        view = self._rendered(self._targets.get(self._look(self.iteration), self._look(self.iteration + 1)))
+            self._use_lens(self.problem.unknowns.lens().detach().cpu().numpy())
+        view = self._rendered(
+            self._targets.get(self._image_look(self.iteration), self._image_look(self.iteration + 1))
+        )
         self._unknowns.adam.zero_grad()
         total, values = weighted_sum(self._losses, view, self.iteration)
         total.backward()
         losses = {name: value.detach() for name, value in values.items()}
         geographic = losses["geographic"] + losses.get("control_by_depth", 0.0)
         self.watch.note(self.iteration, self._watched(losses["photometric"], geographic))
-        stats = self._of_whole(self._own(view.render.stats), view.pose, view.target)
+        stats = self._of_whole_photograph(self._of_trained(view.render.stats), view.pose, view.target)
         self._unknowns.step(self.optimizer.rate_factor * self.schedule.geographic_rate(self.iteration))
         self.optimizer.step(self.iteration, stats.visible)
         if self.exposures is not None:
@@ -171,7 +173,7 @@ class JointTrainer:
             camera = self.views.images.pinhole(index)
             least = 1 if self.options.crops is None else self.options.crops.shrink(camera.width, camera.height)
             shrink = max(self.schedule.shrink(self.iteration, camera.width, camera.height), least)
-            target, pose = self._targets.get(ImageLook(index, shrink)), self.problem.cameras.cam_from_model(index)
+            target, pose = self._targets.get(ImageLook(index, shrink)), self.problem.unknowns.cam_from_model(index)
             render = self._render(self.optimizer.gaussians, pose, target, self._settings(target))
             colour = self._exposed(index, render.colour, target)
             error = (colour - target.colour).abs().mean(dim=-1)
@@ -198,13 +200,13 @@ class JointTrainer:
         self.optimizer.rate_factor *= factor
         self.watch.reset()
 
-    def _look(self, iteration: int) -> ImageLook:
+    def _image_look(self, iteration: int) -> ImageLook:
         index = self.schedule.view(iteration)
         camera = self.views.images.pinhole(index)
         shrink = self.schedule.shrink(iteration, camera.width, camera.height)
         return ImageLook(index, shrink, self.schedule.visit(iteration))
 
-    def _look_through(self, lens: np.ndarray) -> None:
+    def _use_lens(self, lens: np.ndarray) -> None:
         """Render from now on through SfM's lenses with a change (L,) of their parameters."""
         self._lens = lens.copy()
         if self.views.lenses is not None and len(lens):
@@ -213,7 +215,7 @@ class JointTrainer:
     def _rendered(self, target: TargetImage) -> RenderedView:
         """Return the view of this iteration, with all that its losses need."""
         index = self.schedule.view(self.iteration)
-        pose = self.problem.cameras.cam_from_model(index)
+        pose = self.problem.unknowns.cam_from_model(index)
         depth = self.options.surface is not None or self.problem.sees_by_depth(index)
         normal = self.schedule.weight_of_normals(self.iteration) > 0
         settings, optimizer = self._settings(target, depth=depth, normal=normal), self.optimizer
@@ -227,7 +229,17 @@ class JointTrainer:
         points = None if self.views.surface is None else self.views.surface(index)
         count = len(optimizer.gaussians)
         return RenderedView(
-            index, pose, target, shown, rows, count, render, self._own(render.stats), colour, counting, points
+            index,
+            pose,
+            target,
+            shown,
+            rows,
+            count,
+            render,
+            self._of_trained(render.stats),
+            colour,
+            counting,
+            points,
         )
 
     def _settings(self, target: TargetImage, *, depth: bool = False, normal: bool = False) -> RasterSettings:
@@ -251,13 +263,13 @@ class JointTrainer:
             return colour
         return self.exposures.apply(index, colour, squared_radius(target.camera, target.whole, self.device))
 
-    def _own(self, stats: ScreenStats) -> ScreenStats:
+    def _of_trained(self, stats: ScreenStats) -> ScreenStats:
         """Return the statistics of the Gaussians in training, without those that surround the region."""
         # Without a region nothing is left out: to look would make a GPU wait.
         return stats if self.region is None else stats.of_first(len(self.optimizer.shown))
 
     @torch.no_grad()
-    def _of_whole(self, stats: ScreenStats, pose: Tensor, target: TargetImage) -> ScreenStats:
+    def _of_whole_photograph(self, stats: ScreenStats, pose: Tensor, target: TargetImage) -> ScreenStats:
         """Return the statistics as a part of those of the whole photograph."""
         part = target.part
         if part.crops == 1:
@@ -307,7 +319,7 @@ class JointTrainer:
         self.iteration = int(state["iteration"])
         self.schedule.extended_from = int(state["extended_from"])
         self.optimizer.rate_factor = float(state["rate_factor"])
-        self._look_through(state["lens"].cpu().numpy())
+        self._use_lens(state["lens"].cpu().numpy())
         self.watch.reset()
         tensors = {
             name: tensor.to(self.device, copy=True) for name, tensor in unprefixed("gaussians", state).items()
@@ -437,11 +449,12 @@ def load_checkpoint(path: Path) -> dict[str, Tensor]:
         ValueError,
     ) as error:  # torch has no complex halves, texts or foreign byte orders
         raise InputError(
-            "checkpoint-damaged", f"is not a readable checkpoint ({error}). Train without --resume."
+            "checkpoint-damaged", f"is not a readable checkpoint ({error}).", remedy="Train without --resume."
         ) from error
 
 
 def prefixed(prefix: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors of a part of the state by names that begin with the name of the part."""
     return {f"{prefix}/{name}": tensor for name, tensor in state.items()}
 
 

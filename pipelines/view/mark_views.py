@@ -9,7 +9,8 @@ import numpy as np
 from pipelines.core.errors import GeorefError
 from pipelines.core.types import ByteArray, FloatArray
 from pipelines.geometry.cameras import project
-from pipelines.survey.trained_survey import SolvedSurvey
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.survey.solution import Solution
 from pipelines.view.marking import MarkedPoint, appears_in, rays_of
 
 _LINE_PLACES = 60  # of an epipolar line
@@ -21,16 +22,14 @@ _LEAST_CONTRAST = 6.0  # standard deviation of the template's grey values, of 25
 
 
 def epipolar_lines(
-    trained: SolvedSurvey, point: MarkedPoint, camera: int, place_in_geo: FloatArray | None
+    solution: Solution, sparse: SparseModel, point: MarkedPoint, camera: int, place_in_geo: FloatArray | None
 ) -> list[tuple[str, FloatArray]]:
     """Return the lines of sight of a point's marks in other photographs, as pixels (K, 2) of one photograph."""
-    rays, poses = rays_of(point, trained), trained.poses
-    lens, lines = trained.sparse.camera_of(camera), []
-    middle = (
-        trained.point_in_model.mean(axis=0) if len(trained.point_in_model) else poses.cam_center_in_model[camera]
-    )
+    rays, poses = rays_of(point, sparse), solution.poses
+    lens, lines, tie_points = sparse.camera_of(camera), [], solution.point_in_model(sparse)
+    middle = tie_points.mean(axis=0) if len(tie_points) else poses.cam_center_in_model[camera]
     if place_in_geo is not None:
-        middle = trained.geo_from_model.inverse().apply(place_in_geo[None])[0]
+        middle = solution.similarity.inverse().apply(place_in_geo[None])[0]
     for other, bearing in zip(rays.camera.tolist(), rays.bearing_in_cam, strict=True):
         if other == camera:
             continue
@@ -42,7 +41,7 @@ def epipolar_lines(
         beside = np.array([lens.width, lens.height])
         shown = np.isfinite(pixel).all(axis=1) & ((pixel > -beside) & (pixel < 2 * beside)).all(axis=1)
         if shown.sum() > 1:
-            lines.append((trained.sparse.image_name[other], pixel[shown]))
+            lines.append((sparse.image_name[other], pixel[shown]))
     return lines
 
 
@@ -58,10 +57,12 @@ class Proposal:
 
 
 def proposals(
-    trained: SolvedSurvey,
+    solution: Solution,
+    sparse: SparseModel,
     point: MarkedPoint,
     place_in_geo: FloatArray,
     photograph: Callable[[int], ByteArray],
+    *,
     advance: Callable[[float], None],
 ) -> Iterator[Proposal]:
     """Yield the places where unmarked photographs look as the nearest marked one does around its mark.
@@ -69,15 +70,15 @@ def proposals(
     The patch of the photograph is brought onto that of the mark by planes through the point, level and across the
     line of sight; the better one counts.
     """
-    names = trained.sparse.image_name
-    near = appears_in(place_in_geo, trained)
+    names = sparse.image_name
+    near = appears_in(place_in_geo, solution, sparse)
     marked = [camera for camera, _ in near if names[camera] in point.marks]
     wanted = [camera for camera, _ in near if names[camera] not in point.marks]
     if not marked:
         return
     source = marked[0]
     mark = np.array(point.marks[names[source]])
-    half = _TEMPLATE_PX + _SEARCH_PX
+    half, centers = _TEMPLATE_PX + _SEARCH_PX, solution.center_in_geo
     template = _patch(photograph(source), np.eye(2), mark, _TEMPLATE_PX)
     if template.std() < _LEAST_CONTRAST:
         return
@@ -87,8 +88,8 @@ def proposals(
             image = photograph(camera)
         except GeorefError:  # a photograph that cannot be read has no proposal
             image = None
-        for axes in _planes(trained, source, place_in_geo) if image is not None else ():
-            turn, expected = _affine(trained, source, camera, place_in_geo, axes)
+        for axes in _planes(centers[source], place_in_geo) if image is not None else ():
+            turn, expected = _affine(solution, sparse, (source, camera), place_in_geo, axes)
             if not np.isfinite(turn).all() or not 0.1 < abs(np.linalg.det(turn)) < 10:
                 continue
             assert image is not None
@@ -104,28 +105,28 @@ def proposals(
         advance((number + 1) / len(wanted))
 
 
-def _planes(trained: SolvedSurvey, source: int, place_in_geo: FloatArray) -> Iterator[FloatArray]:
-    """Yield two axes (2, 3) in `geo` of each plane through a point that is tried."""
+def _planes(center_in_geo: FloatArray, place_in_geo: FloatArray) -> Iterator[FloatArray]:
+    """Yield two axes (2, 3) in `geo` of each plane through a point that is tried, as a camera sees it."""
     yield np.eye(3)[:2]
-    center = trained.geo_from_model.apply(trained.poses.cam_center_in_model[source][None])[0]
-    ray = (place_in_geo - center) / np.linalg.norm(place_in_geo - center)
+    ray = (place_in_geo - center_in_geo) / np.linalg.norm(place_in_geo - center_in_geo)
     first = np.cross(ray, np.eye(3)[int(np.abs(ray).argmin())])
     first /= np.linalg.norm(first)
     yield np.stack([first, np.cross(ray, first)])
 
 
 def _affine(
-    trained: SolvedSurvey, source: int, camera: int, place_in_geo: FloatArray, axes: FloatArray
+    solution: Solution, sparse: SparseModel, cameras: tuple[int, int], place_in_geo: FloatArray, axes: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the matrix (2, 2) from pixels of one photograph to those of another, where the point is at (2,)."""
-    center = trained.geo_from_model.apply(trained.poses.cam_center_in_model[source][None])[0]
-    step = float(np.linalg.norm(place_in_geo - center)) / trained.sparse.camera_of(source).mean_focal_px
+    poses, geo_from_model = solution.poses, solution.similarity
+    center = geo_from_model.apply(poses.cam_center_in_model[cameras[0]][None])[0]
+    step = float(np.linalg.norm(place_in_geo - center)) / sparse.camera_of(cameras[0]).mean_focal_px
     in_geo = place_in_geo + step * np.concatenate([np.zeros((1, 3)), axes])
-    in_model = trained.geo_from_model.inverse().apply(in_geo)
+    in_model = geo_from_model.inverse().apply(in_geo)
     pixel = []
-    for one in (source, camera):
-        in_cam = (in_model - trained.poses.cam_center_in_model[one]) @ trained.poses.cam_from_model[one].T
-        pixel.append(project(trained.sparse.camera_of(one), in_cam))
+    for one in cameras:
+        in_cam = (in_model - poses.cam_center_in_model[one]) @ poses.cam_from_model[one].T
+        pixel.append(project(sparse.camera_of(one), in_cam))
     by_plane = [(each[1:] - each[0]).T for each in pixel]
     if abs(np.linalg.det(by_plane[0])) < 1e-6:
         return np.full((2, 2), np.nan), pixel[1][0]

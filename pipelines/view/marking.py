@@ -20,9 +20,10 @@ from pipelines.core.files import replace_texts
 from pipelines.core.products import ImageName, Product, load_json
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.geometry.cameras import project
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.marks import MarkRays, mark_angles, mark_rays
+from pipelines.survey.solution import Solution
 from pipelines.survey.survey import Mark, Survey, SurveyedPoint
-from pipelines.survey.trained_survey import SolvedSurvey
 from pipelines.view.saved import changing
 
 CONTROL, CHECK, MARKS = "gcp_list.txt", "checkpoints.txt", "marks.json"
@@ -61,9 +62,9 @@ def points_to_mark(survey: Survey, xyz_of: Callable[[tuple[SurveyedPoint, ...]],
     return to_mark
 
 
-def rays_of(point: MarkedPoint, trained: SolvedSurvey) -> MarkRays:
-    """Return the rays of the marks of one point in registered images, through the trained lenses."""
-    return mark_rays((surveyed_marks(point),), trained.sparse, wrong=True)
+def rays_of(point: MarkedPoint, sparse: SparseModel) -> MarkRays:
+    """Return the rays of the marks of one point in registered images, through the solved lenses."""
+    return mark_rays((surveyed_marks(point),), sparse, wrong=True)
 
 
 def surveyed_marks(point: MarkedPoint) -> SurveyedPoint:
@@ -72,20 +73,20 @@ def surveyed_marks(point: MarkedPoint) -> SurveyedPoint:
     return SurveyedPoint(name=point.name, position_in_geo=(0.0, 0.0, 0.0), cov_in_geo=_IDENTITY, marks=marks)
 
 
-def residuals_px(point_in_geo: FloatArray, rays: MarkRays, trained: SolvedSurvey) -> FloatArray:
+def residuals_px(point_in_geo: FloatArray, rays: MarkRays, solution: Solution) -> FloatArray:
     """Return the distances (K,) in pixels between marks and the projections of a point (3,)."""
-    place = trained.geo_from_model.inverse().apply(point_in_geo[None])
-    angle = mark_angles(rays, place, trained.poses.cam_from_model, trained.poses.cam_center_in_model)
+    place, poses = solution.similarity.inverse().apply(point_in_geo[None]), solution.poses
+    angle = mark_angles(rays, place, poses.cam_from_model, poses.cam_center_in_model)
     return np.asarray(angle / rays.sigma_rad * rays.sigma_px)
 
 
-def appears_in(point_in_geo: FloatArray, trained: SolvedSurvey) -> list[tuple[int, FloatArray]]:
+def appears_in(point_in_geo: FloatArray, solution: Solution, sparse: SparseModel) -> list[tuple[int, FloatArray]]:
     """Return the cameras whose photograph must show a point (3,), the nearest first, with its pixel (2,) there."""
-    place, poses = trained.geo_from_model.inverse().apply(point_in_geo[None])[0], trained.poses
+    place, poses = solution.similarity.inverse().apply(point_in_geo[None])[0], solution.poses
     shown = []
-    for camera in range(len(trained.sparse.image_name)):
+    for camera in range(len(sparse.image_name)):
         in_cam = poses.cam_from_model[camera] @ (place - poses.cam_center_in_model[camera])
-        lens = trained.sparse.camera_of(camera)
+        lens = sparse.camera_of(camera)
         if in_cam[2] <= 0:
             continue
         pixel = project(lens, in_cam[None])[0]
@@ -109,7 +110,9 @@ def mark_texts(crs: str, points: Sequence[MarkedPoint]) -> dict[str, str]:
             for image, (x_px, y_px) in point.marks.items():
                 bad = next((text for text in (point.name, image) if len(text.split()) != 1), None)
                 if bad is not None:
-                    raise InputError("name-with-space", f"Names in {file} cannot contain spaces. Rename {bad!r}.")
+                    raise InputError(
+                        "name-with-space", f"Names in {file} cannot contain spaces.", remedy=f"Rename {bad!r}."
+                    )
                 x, y, z = point.xyz
                 lines.append(f"{x:.12g}\t{y:.12g}\t{z:.4f}\t{x_px:.3f}\t{y_px:.3f}\t{image}\t{point.name}")
         if len(lines) > 1:
@@ -180,7 +183,9 @@ class KeptMarks:
         """Make a point, or change its place in the CRS (None: not) and use; a GeorefError: nothing was changed."""
         if len(name.split()) != 1:
             raise InputError(
-                "name-with-space", f"Names in {CONTROL} and {CHECK} cannot contain spaces. Rename {name!r}."
+                "name-with-space",
+                f"Names in {CONTROL} and {CHECK} cannot contain spaces.",
+                remedy=f"Rename {name!r}.",
             )
         former = self._records.get((name, None))
         lla = former.lla if isinstance(former, KeptPoint) else None
@@ -194,7 +199,8 @@ class KeptMarks:
         if name in self._surveyed:
             raise InputError(
                 "point-of-survey",
-                f"{name} is a point of the survey. Remove its marks, or run `georef ingest` without the point.",
+                f"{name} is a point of the survey.",
+                remedy="Remove its marks, or run `georef ingest` without the point.",
             )
         self._change(dict.fromkeys(key for key in self._records if key[0] == name))
 

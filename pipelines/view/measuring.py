@@ -18,11 +18,11 @@ from pipelines.formats.geotiff import sampled_raster
 from pipelines.surface.picking import SurfacePoint, SurfaceReader
 from pipelines.surface.plan_heights import cameras_of, heights_in_plan
 from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.marks import MarkRays
+from pipelines.survey.marks import MarkRays, triangulated_points
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.saved_measurements import Quantity
+from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import TargetCrs, usable_crs
-from pipelines.survey.trained_survey import triangulated_points
 from pipelines.view import quantities
 
 # Rasters of the workspace that may be the base of a volume, with those of their σ.
@@ -68,14 +68,12 @@ class MeasuringModel:
         InputError: a product is damaged, or the CRS cannot be used here.
     """
 
-    def __init__(self, workspace: Workspace, renderer: ModelRenderer, crs: CrsOptions) -> None:
-        self._workspace = workspace
-        self.trained, self.reader = renderer.trained, SurfaceReader(renderer)
-        survey = self.trained.survey
-        centers = self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model)
-        self.target: TargetCrs = usable_crs(crs, survey.origin, centers, survey.vertical)
-        is_stated = is_checked(self.trained.model.cautions)
-        self.posterior = posterior_of(workspace, self.trained.model, self.trained.sfm) if is_stated else None
+    def __init__(self, workspace: Workspace, survey: Survey, renderer: ModelRenderer, crs: CrsOptions) -> None:
+        self._workspace, self.survey, self.solution = workspace, survey, renderer.model
+        self.reader, self._center_in_geo = SurfaceReader(renderer), renderer.model.center_in_geo
+        self.target: TargetCrs = usable_crs(crs, survey.origin, self._center_in_geo, survey.vertical)
+        is_stated = is_checked(self.solution.cautions)
+        self.posterior = posterior_of(workspace, self.solution, renderer.sfm) if is_stated else None
         self.without_sigma = "" if self.posterior is not None else "nothing checks the σ of the positions"
 
     def triangulated(self, rays: MarkRays) -> tuple[FloatArray, FloatArray | None]:
@@ -83,13 +81,13 @@ class MeasuringModel:
 
         The intersection is NaN with fewer than two marks; the covariance is None where none is stated.
         """
-        position = triangulated_points(self.trained, rays)
+        position = triangulated_points(self.solution, rays)
         if self.posterior is None or not np.isfinite(position).all():
             return position[0], None
         absolute = self.posterior.datum - self.posterior.datum_against_points
         return position[0], self.posterior.of_marked_points(position, rays)[0] + absolute
 
-    def place(self, point: SurfacePoint) -> tuple[FloatArray, FloatArray | None]:
+    def coordinates(self, point: SurfacePoint) -> tuple[FloatArray, FloatArray | None]:
         """Return a point (3,) in the CRS, easting or longitude first, and its σ (3,) east, north, up in metres.
 
         σ is that of georeference, cameras, lens and surface; None: not known.
@@ -98,12 +96,12 @@ class MeasuringModel:
         sigma_m = None if joint.cov_in_geo is None else np.sqrt(np.diag(joint.cov_in_geo))
         return self.target.xyz_from_geo(point.position_in_geo[None])[0], sigma_m
 
-    def jointly(self, points: Sequence[SurfacePoint]) -> quantities.MeasuredPoints:
+    def jointly(self, points: Sequence[SurfacePoint]) -> quantities.PickedPoints:
         position = np.array([point.position_in_geo for point in points]).reshape(-1, 3)
         cov = self._joint_covariance([*position], [point.cameras for point in points])
         cov = None if cov is None else cov + block_diag(*(point.cov_of_surface for point in points))
         height_m = np.asarray(self.target.xyz_from_geo(position)[:, 2] * self.target.crs.height_unit_m)
-        return quantities.MeasuredPoints(position, cov, height_m)
+        return quantities.PickedPoints(position, cov, height_m)
 
     def area(self, corners: Sequence[SurfacePoint], fineness: Fineness) -> tuple[Quantity, ...]:
         """Return the area of a polygon, in plan and on the surface."""
@@ -165,20 +163,24 @@ class MeasuringModel:
         """Return heights (N,) of a raster below places (N, 3) in `geo`, in the viewer's CRS, and their mean σ."""
         path = self._workspace.root / "raster" / name
         if name not in BASE_RASTERS or not path.is_file():
-            raise InputError("no-base-raster", f"There is no raster/{name}. Make it with `georef export-raster`.")
+            raise InputError(
+                "no-base-raster", f"There is no raster/{name}.", remedy="Make it with `georef export-raster`."
+            )
         sidecar = load_json(CrsSidecar, sidecar_path(path))
         other = usable_crs(
             CrsOptions(crs=sidecar.crs if sidecar.crs_wkt else None),
-            self.trained.survey.origin,
+            self.survey.origin,
             places,
-            self.trained.survey.vertical,
+            self.survey.vertical,
         )
         xyz = other.xyz_from_geo(places)
         height, sigma = (sampled_raster(path.with_name(file), xyz[:, :2]) for file in (name, BASE_RASTERS[name]))
         known = np.isfinite(height)
         if known.mean() < _LEAST_COVERED:
             raise InputError(
-                "base-not-covered", f"raster/{name} does not cover the polygon. Draw it inside the raster."
+                "base-not-covered",
+                f"raster/{name} does not cover the polygon.",
+                remedy="Draw it inside the raster.",
             )
         height[~known] = np.median(height[known])
         in_geo = other.geo_from_xyz(np.column_stack([xyz[:, :2], height]))
@@ -227,7 +229,7 @@ class MeasuringModel:
 
     def _pixel_m(self, points: Sequence[SurfacePoint]) -> float:
         """Return the mean width of a training pixel at points."""
-        centers = self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model)
+        centers = self._center_in_geo
         widths = [
             float(np.linalg.norm(centers[camera] - point.position_in_geo)) / self.reader.focal_px(int(camera))
             for point in points

@@ -5,8 +5,6 @@ left out block by block, so that a view from near has the trained model itself; 
 """
 
 import threading
-from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 
@@ -16,7 +14,6 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.level_of_detail import coarser
 from pipelines.splat.rasterizer.api import RasterSettings, Render, Window
 from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.trained_survey import TrainedSurvey
 
 MOST_GAUSSIANS = 120_000  # of a picture that moves: a tenth of a second on two cores
 
@@ -27,16 +24,16 @@ class MotionModels:
     def __init__(self, finest: ModelRenderer) -> None:
         self._models = [finest]
 
-    def make(self, renderer_of: Callable[[TrainedSurvey], ModelRenderer], ended: threading.Event) -> None:
+    def make(self, ended: threading.Event) -> None:
         """Make the coarser models, if a processor draws; `ended` gives up."""
         finest = self._models[0]
-        trained = finest.trained
-        if ended.is_set() or finest.device.type != "cpu" or len(trained.gaussians) <= MOST_GAUSSIANS:
+        gaussians = finest.gaussians
+        if ended.is_set() or finest.device.type != "cpu" or len(gaussians) <= MOST_GAUSSIANS:
             return
         finest.blocks  # noqa: B018, made now, so that no picture waits for it
-        for splat in coarser(SplatArrays(**trained.gaussians.arrays()), MOST_GAUSSIANS):
-            values = {name: torch.from_numpy(getattr(splat, name)) for name in trained.gaussians.tensors()}
-            model = renderer_of(replace(trained, gaussians=Gaussians(**values)))
+        for splat in coarser(SplatArrays(**gaussians.arrays()), MOST_GAUSSIANS):
+            values = {name: torch.from_numpy(getattr(splat, name)) for name in gaussians.tensors()}
+            model = finest.showing(Gaussians(**values))
             model.blocks  # noqa: B018
             self._models.append(model)
             if ended.is_set():
@@ -48,12 +45,12 @@ class MotionModels:
         if last is self._models[0]:
             return last.render(pose, depth=True)
         matrix, pinhole = pose_matrix(pose.cam_from_model, pose.center_in_model), pose.pinhole
-        settings = RasterSettings(last.trained.model.sh_degree, last.trained.model.background, depth=True)
+        settings = RasterSettings(last.model.sh_degree, last.model.background, depth=True)
         for model in self._models:
             count = model.blocks.count_shown(matrix, pinhole, settings)
             if count <= MOST_GAUSSIANS:
                 # Rows are gathered where that leaves out the most of them.
-                few = 2 * count < len(model.trained.gaussians)
+                few = 2 * count < len(model.gaussians)
                 window = Window(0, 0, pinhole.width, pinhole.height) if few else None
                 return model.render(pose, depth=True, window=window)
         return last.render(pose, depth=True)

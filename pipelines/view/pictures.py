@@ -7,7 +7,6 @@ The viewer's frame is `geo` moved to the middle of the scene: metres, east, nort
 """
 
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
@@ -23,13 +22,16 @@ from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Camera, Pinhole, ViewPose, distort, undistort
 from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.report.plots.style import colours_of
+from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.surface import measured_depth
 from pipelines.surface.picking import Sight
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.area import photographs_that_see
 from pipelines.survey.photographs import decoded_photograph
-from pipelines.survey.trained_survey import SolvedSurvey, TrainedSurvey
+from pipelines.survey.solution import Solution
+from pipelines.survey.survey import Survey
 from pipelines.view.motion import MotionModels
 
 Colouring = Literal["photographs", "height", "sigma", "views"]
@@ -92,39 +94,40 @@ class ViewFrame:
             start, pixel_rad = start + (away - near) * direction, pixel_rad * away / near
         return Sight(start, direction, pixel_rad)
 
-    def place(self, point_in_geo: FloatArray) -> FloatArray:
+    def from_geo(self, point_in_geo: FloatArray) -> FloatArray:
         """Return places (…, 3) in the viewer's frame."""
         return np.asarray(point_in_geo - self.middle_in_geo)
 
 
-def frame_of(trained: TrainedSurvey) -> ViewFrame:
-    """Return the frame of a trained survey's scene: its SfM points without the rim, or its cameras without any."""
-    points = trained.point_in_model if len(trained.point_in_model) else trained.poses.cam_center_in_model
-    in_geo = trained.geo_from_model.apply(points)
+def frame_of(solution: Solution, sfm: SparseModel) -> ViewFrame:
+    """Return the frame of a solution's scene: its SfM points without the rim, or its cameras without any."""
+    in_geo = solution.center_in_geo
+    if len(sfm.point_in_local):
+        in_geo = solution.similarity.apply(solution.point_in_model(sfm))
     low, high = np.quantile(in_geo, [_RIM, 1 - _RIM], axis=0)
     radius_m = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
     middle = (low + high) / 2
-    return ViewFrame(Similarity(1.0, np.eye(3), -middle) @ trained.geo_from_model, middle, radius_m)
+    return ViewFrame(Similarity(1.0, np.eye(3), -middle) @ solution.similarity, middle, radius_m)
 
 
 class Photographs:
     """Photographs of the survey at full size, decoded on demand."""
 
-    def __init__(self, workspace: Workspace, trained: SolvedSurvey) -> None:
-        self._folder = photograph_folder(workspace, trained.survey.image_dir)
-        self._trained = trained
+    def __init__(self, workspace: Workspace, survey: Survey, sparse: SparseModel) -> None:
+        self._folder, self._sparse = photograph_folder(workspace, survey.image_dir), sparse
+        self._sha256 = {image.name: image.sha256 for image in survey.images}
         self.full = lru_cache(_KEPT_PHOTOGRAPHS)(self._decoded)
 
     def _decoded(self, camera: int) -> ByteArray:
         """Return a photograph (H, W, 3) with its distortion; an InputError: unreadable, or not of the survey."""
-        name = self._trained.sparse.image_name[camera]
+        name = self._sparse.image_name[camera]
         file = self._folder / name
-        sha256 = {image.name: image.sha256 for image in self._trained.survey.images}
-        pixels = decoded_photograph(file, sha256.get(name, ""))
-        lens = self._trained.sparse.camera_of(camera)
+        pixels = decoded_photograph(file, self._sha256.get(name, ""))
+        lens = self._sparse.camera_of(camera)
         if pixels is None or pixels.shape[:2] != (lens.height, lens.width):
-            message = "cannot be decoded, or has another size than its camera. Restore the photograph."
-            raise InputError("photograph-damaged", message, path=file)
+            message = "cannot be decoded, or has another size than its camera."
+            remedy = "Restore the photograph."
+            raise InputError("photograph-damaged", message, path=file, remedy=remedy)
         return np.ascontiguousarray(pixels[..., ::-1])
 
 
@@ -165,16 +168,10 @@ class Painter:
     """Painter of the pictures of pages."""
 
     def __init__(
-        self,
-        renderer_of: Callable[[TrainedSurvey], ModelRenderer],
-        photographs: Photographs,
-        trained: TrainedSurvey,
-        frame: ViewFrame,
-        grid: AccuracyGrid | None,
+        self, renderer: ModelRenderer, photographs: Photographs, frame: ViewFrame, grid: AccuracyGrid | None
     ) -> None:
-        self._trained, self._photographs, self._frame, self._grid = trained, photographs, frame, grid
-        self._renderer_of_survey = renderer_of
-        self._renderer_of = lru_cache(2)(lambda box, faded: renderer_of(self._clipped(box, faded)))
+        self._renderer, self._photographs, self._frame, self._grid = renderer, photographs, frame, grid
+        self._renderer_of = lru_cache(2)(lambda box, faded: renderer.showing(self._clipped(box, faded)))
         self._making = threading.Lock()
         self._motion: MotionModels | None = None
 
@@ -182,7 +179,7 @@ class Painter:
         """Make the coarser models of the whole scene for pictures that move; `ended` gives up."""
         with self._making:
             self._motion = MotionModels(self._renderer_of(None, True))
-        self._motion.make(self._renderer_of_survey, ended)
+        self._motion.make(ended)
 
     def paint(self, camera: ViewerCamera, wanted: Wanted) -> PageView:
         """Return the picture of a page's camera; a photograph over it shows only from its own place.
@@ -199,13 +196,13 @@ class Painter:
                 renderer = self._renderer_of(wanted.box, whole)
             render = renderer.render(pose, depth=True)
         depth = measured_depth(render).cpu().numpy() * self._frame.view_from_model.scale
-        behind = torch.tensor(wanted.background) - torch.tensor(self._trained.model.background)
+        behind = torch.tensor(wanted.background) - torch.tensor(self._renderer.model.background)
         colour = render.colour.cpu() + (1 - render.alpha.cpu())[..., None] * behind
         rgb, scale = (255 * colour.clamp(0, 1)).round().byte().numpy(), None
         if wanted.colouring != "photographs":
             rgb, scale = self._false_colours(rgb, depth, camera, wanted.colouring)
         if wanted.photograph is not None and wanted.share > 0:
-            apart = self._trained.poses.cam_center_in_model[wanted.photograph] - pose.center_in_model
+            apart = self._renderer.poses.cam_center_in_model[wanted.photograph] - pose.center_in_model
             if float(np.linalg.norm(apart)) < _SAME_PLACE * self._frame.radius_m:
                 rgb = self._blended(rgb, wanted, pose)
         shrunk = min(1.0, _DEPTH_PX / max(depth.shape))
@@ -213,22 +210,22 @@ class Painter:
         coarse = cv2.resize(depth.astype(np.float32), small, interpolation=cv2.INTER_NEAREST)
         return PageView(rgb, np.asarray(coarse, dtype=np.float32), scale)
 
-    def _clipped(self, box: Box | None, faded: bool) -> TrainedSurvey:
-        """Return the survey with the Gaussians in a box, or without those far from the scene."""
+    def _clipped(self, box: Box | None, faded: bool) -> Gaussians:
+        """Return the Gaussians in a box, or those that are not far from the scene."""
+        gaussians = self._renderer.gaussians
         if box is None and not faded:
-            return self._trained
-        places = self._frame.view_from_model.apply(self._trained.gaussians.means.double().numpy())
+            return gaussians
+        places = self._frame.view_from_model.apply(gaussians.means.double().numpy())
         if box is None:
             whole, gone = (factor * self._frame.radius_m for factor in _FADED)
             share = torch.from_numpy(np.clip((gone - np.linalg.norm(places, axis=1)) / (gone - whole), 1e-6, 1.0))
             if bool((share == 1).all()):
-                return self._trained
-            opacity = torch.sigmoid(self._trained.gaussians.logit_opacities) * share.float()
-            logit = torch.where(share == 1, self._trained.gaussians.logit_opacities, torch.logit(opacity))
-            shown = replace(self._trained.gaussians, logit_opacities=logit)
-            return replace(self._trained, gaussians=shown)
+                return gaussians
+            opacity = torch.sigmoid(gaussians.logit_opacities) * share.float()
+            logit = torch.where(share == 1, gaussians.logit_opacities, torch.logit(opacity))
+            return replace(gaussians, logit_opacities=logit)
         inside = ((places >= box[:3]) & (places <= box[3:])).all(axis=1)
-        return replace(self._trained, gaussians=self._trained.gaussians.select(torch.from_numpy(inside)))
+        return gaussians.select(torch.from_numpy(inside))
 
     def _false_colours(
         self, rgb: ByteArray, depth: FloatArray, camera: ViewerCamera, colouring: Colouring
@@ -252,7 +249,7 @@ class Painter:
         elif colouring == "sigma" and self._grid is not None:
             values[known] = np.sqrt(np.trace(self._grid.cov_at(in_geo), axis1=1, axis2=2))
         else:
-            values[known] = photographs_that_see(self._trained, in_geo)
+            values[known] = photographs_that_see(self._renderer.model, self._renderer.sfm, in_geo)
         low, high = np.quantile(values[known], [0.02, 0.98]).tolist() if known.any() else (0.0, 1.0)
         tint = colours_of(values.ravel(), low, high).reshape(*values.shape, 3)
         whole = cv2.resize(np.ascontiguousarray(tint), rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST)
@@ -264,15 +261,15 @@ class Painter:
 
     def _blended(self, rgb: ByteArray, wanted: Wanted, pose: ViewPose) -> ByteArray:
         """Return a picture with the photograph over it, as the photograph's lens shows the picture's rays."""
-        trained, camera = self._trained, wanted.photograph
+        camera = wanted.photograph
         assert camera is not None
         height, width = rgb.shape[:2]
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
-        turn = trained.poses.cam_from_model[camera] @ pose.cam_from_model.T
+        turn = self._renderer.poses.cam_from_model[camera] @ pose.cam_from_model.T
         own = pose.pinhole.rays(pixels) @ turn.T
         ahead = own[..., 2] > 0
         slope = own[..., :2] / np.where(ahead, own[..., 2], 1.0)[..., None]
-        lens = trained.sparse.camera_of(camera)
+        lens = self._renderer.sparse.camera_of(camera)
         place = np.asarray(distort(lens, slope)) - 0.5
         # Beyond its fold a lens polynomial leads back into the picture, to the pixel of another ray.
         ahead &= np.linalg.norm(slope, axis=-1) < _widest_slope(lens)

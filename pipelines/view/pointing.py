@@ -26,8 +26,8 @@ def pointing_covariance(
             sight = frame.sight(camera, *(np.array(pixel) + sign * _STEP_PX * axis))
             distance = reader.rendered_distance(sight)
             if distance is not None:
-                ends.append(reader.renderer.trained.geo_from_model.apply(sight.at(distance)[None])[0])
-                across_m = distance * sight.pixel_rad * reader.renderer.trained.geo_from_model.scale
+                ends.append(reader.renderer.geo_from_model.apply(sight.at(distance)[None])[0])
+                across_m = distance * sight.pixel_rad * reader.renderer.geo_from_model.scale
         if len(ends) < 2 and not across_m:
             return np.zeros((3, 3))
         along = (ends[1] - ends[0]) / (2 * _STEP_PX) if len(ends) == 2 else np.full(3, np.inf)

@@ -18,9 +18,11 @@ from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import ByteArray, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.tables import table_text
-from pipelines.survey.marks import wrong_marks
-from pipelines.survey.survey import Mark, PointMarks, SurveyedPoint
-from pipelines.survey.trained_survey import SolvedSurvey, load_cameras, triangulated_points
+from pipelines.geometry.sparse_model import SparseModel
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.marks import triangulated_points, wrong_marks
+from pipelines.survey.solution import Solution, read_sfm, read_solution
+from pipelines.survey.survey import Mark, PointMarks, Survey, SurveyedPoint
 from pipelines.view.mark_views import proposals
 from pipelines.view.marking import SIGMA_PX, MarkedPoint, appears_in, rays_of
 from pipelines.view.options import ProposalOptions
@@ -59,8 +61,10 @@ def propose_marks(workspace: Workspace, options: ProposalOptions, progress: Prog
         MissingProductError: `init-sim3` has not run.
         InputError: no point was surveyed.
     """
-    solved = load_cameras(workspace)
-    found, left_out = proposed_marks(solved, Photographs(workspace, solved).full, options.reach, progress)
+    solution, survey = read_solution(workspace), load_survey(workspace)
+    sparse = solution.with_lenses(read_sfm(workspace, solution))
+    photograph = Photographs(workspace, survey, sparse).full
+    found, left_out = proposed_marks(survey, solution, sparse, photograph, options.reach, progress=progress)
     rows = []
     for each in found:
         numbers = (each.mark.x_px, each.mark.y_px, each.mark.sigma_px)
@@ -74,48 +78,57 @@ def propose_marks(workspace: Workspace, options: ProposalOptions, progress: Prog
 
 
 def proposed_marks(
-    solved: SolvedSurvey, photograph: Callable[[int], ByteArray], reach_px: float, progress: Progress = SILENT
+    survey: Survey,
+    solution: Solution,
+    sparse: SparseModel,
+    photograph: Callable[[int], ByteArray],
+    reach_px: float,
+    *,
+    progress: Progress = SILENT,
 ) -> tuple[list[ProposedMark], tuple[str, ...]]:
     """Return marks of surveyed points in photographs without them, and which were left out as others contradict.
 
     Args:
+        sparse: the SfM model with the solved lenses.
         photograph: returns that of a camera (H, W, 3) RGB; a GeorefError: it has no marks.
         reach_px: how far from its expected pixel a quartered target may be.
     """
-    survey = solved.survey
     points = (*survey.control_points, *survey.check_points, *survey.unmarked_points)
     if not points:
-        raise InputError("no-ground-points", "The survey has no ground points. Give `georef ingest` --gcp.")
+        raise InputError(
+            "no-ground-points", "The survey has no ground points.", remedy="Give `georef ingest` --gcp."
+        )
     places = {}  # where points are expected (3,) in `geo`
     for point in points:
         own = {mark.image: (mark.x_px, mark.y_px) for mark in point.marks}
-        by_marks = triangulated_points(solved, rays_of(MarkedPoint(point.name, None, marks=own), solved))[0]
+        by_marks = triangulated_points(solution, rays_of(MarkedPoint(point.name, None, marks=own), sparse))[0]
         places[point.name] = by_marks if np.isfinite(by_marks).all() else np.array(point.position_in_geo)
     found: list[ProposedMark] = []
     wanted: dict[int, list[tuple[str, FloatArray]]] = defaultdict(list)
     for point in points:
         marked = {mark.image for mark in point.marks}
-        for camera, pixel in appears_in(places[point.name], solved):
-            if solved.sparse.image_name[camera] not in marked:
+        for camera, pixel in appears_in(places[point.name], solution, sparse):
+            if sparse.image_name[camera] not in marked:
                 wanted[camera].append((point.name, pixel))
     with progress.task("quartered targets", len(wanted)) as task:
         for camera, mine in wanted.items():
-            found += _quarters(solved.sparse.image_name[camera], mine, photograph, camera, reach_px)
+            found += _quarters(sparse.image_name[camera], mine, photograph, camera, reach_px)
             task.advance()
-    found, left_out = _met(points, found, solved)
+    found, left_out = _met(points, found, sparse)
     with progress.task("likeness", len(points)) as task:
         for point in points:
             of_point = [*point.marks, *(each.mark for each in found if each.point == point.name)]
             marks = {mark.image: (mark.x_px, mark.y_px) for mark in of_point}
+            marked_point = MarkedPoint(point.name, None, marks=marks)
             alike = proposals(
-                solved, MarkedPoint(point.name, None, marks=marks), places[point.name], photograph, lambda _: None
+                solution, sparse, marked_point, places[point.name], photograph, advance=lambda _: None
             )
             for each in alike if marks else ():
                 x_px, y_px = each.place_px
                 mark = Mark(image=each.image, x_px=x_px, y_px=y_px, sigma_px=_CORRELATED_SIGMA_PX)
                 found.append(ProposedMark(point.name, mark, "correlation", each.score))
             task.advance()
-    found, more = _met(points, found, solved)
+    found, more = _met(points, found, sparse)
     return sorted(found, key=lambda each: (each.point, each.mark.image)), (*left_out, *more)
 
 
@@ -141,7 +154,7 @@ def _quarters(
 
 
 def _met(
-    points: Sequence[SurveyedPoint], found: Sequence[ProposedMark], solved: SolvedSurvey
+    points: Sequence[SurveyedPoint], found: Sequence[ProposedMark], sparse: SparseModel
 ) -> tuple[list[ProposedMark], tuple[str, ...]]:
     """Return the proposals but those that the other marks of their points do not meet, and these."""
     by_point: dict[str, list[Mark]] = defaultdict(list)
@@ -158,7 +171,7 @@ def _met(
         )
         for point in points
     ]
-    wrong = {(mark.point, mark.image): mark.off_px for mark in wrong_marks(all_marks, solved.sparse)}
+    wrong = {(mark.point, mark.image): mark.off_px for mark in wrong_marks(all_marks, sparse)}
     kept = [each for each in found if (each.point, each.mark.image) not in wrong]
     left_out = [
         f"{each.point} in {each.mark.image} ({wrong[each.point, each.mark.image]:.0f} px)"

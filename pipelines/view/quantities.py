@@ -18,7 +18,7 @@ RimBase = Literal["plane", "mean", "lowest"]
 
 
 @dataclass(frozen=True)
-class MeasuredPoints:
+class PickedPoints:
     """J measured points."""
 
     position_in_geo: FloatArray  # (J, 3) metres
@@ -28,7 +28,7 @@ class MeasuredPoints:
     height_m: FloatArray
 
 
-def distances(points: MeasuredPoints) -> tuple[Quantity, ...]:
+def distances(points: PickedPoints) -> tuple[Quantity, ...]:
     """Return distance in space, horizontal distance and height difference from the first point to the second."""
     line = points.position_in_geo[1] - points.position_in_geo[0]
     rise = float(points.height_m[1] - points.height_m[0])
@@ -44,7 +44,7 @@ def distances(points: MeasuredPoints) -> tuple[Quantity, ...]:
     )
 
 
-def length(points: MeasuredPoints) -> tuple[Quantity, ...]:
+def length(points: PickedPoints) -> tuple[Quantity, ...]:
     """Return the length of the line through the points, in space and in plan."""
     legs, cov = np.diff(points.position_in_geo, axis=0), points.cov_in_geo
     in_plan = legs * [1.0, 1.0, 0.0]
@@ -55,7 +55,7 @@ def length(points: MeasuredPoints) -> tuple[Quantity, ...]:
     )
 
 
-def plan_area(points: MeasuredPoints) -> Quantity:
+def plan_area(points: PickedPoints) -> Quantity:
     """Return the horizontal area of the polygon of the points, in either direction."""
     area, gradient = _area(points)
     return Quantity("horizontal area", area, propagated(gradient, points.cov_in_geo), "m²")
@@ -88,7 +88,7 @@ def _unit(vector: FloatArray) -> FloatArray:
 class SampledSurface:
     """Surface within a polygon, sampled on a grid in plan."""
 
-    corners: MeasuredPoints  # of the polygon
+    corners: PickedPoints  # of the polygon
     samples: FloatArray  # N points of the surface, without covariance
     sigma_up_m: FloatArray  # (N,) σ of the samples' own heights, independent of each other
     # (3 (J + M), 3 (J + M)) m², joint, of the corners and of those M samples that `chosen` names, without the
@@ -220,7 +220,7 @@ def grid_in_polygon(corners: FloatArray, spacing: float) -> FloatArray:
     return np.asarray(places[shapely.contains_xy(shapely.Polygon(corners), places)])
 
 
-def _area(points: MeasuredPoints) -> tuple[float, FloatArray]:
+def _area(points: PickedPoints) -> tuple[float, FloatArray]:
     """Return the horizontal area of a polygon, and its derivative (J, 3) by the points."""
     east, north = (points.position_in_geo[:, axis] - points.position_in_geo[:, axis].mean() for axis in (0, 1))
     twice = float(east @ np.roll(north, -1) - north @ np.roll(east, -1))

@@ -20,13 +20,13 @@ Index = Annotated[int, Field(ge=0, le=1_000_000)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
-class Request(BaseModel):
+class RequestBody(BaseModel):
     """Body of a request."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
 
-class CameraRequest(Request):
+class CameraRequest(RequestBody):
     """Camera of a page, in the frame of the viewer; `rotation` is camera ← view, in rows."""
 
     rotation: Annotated[tuple[Number, ...], Field(min_length=9, max_length=9)]
@@ -70,7 +70,7 @@ class PickRequest(CameraRequest):
     y: Number
 
 
-class Place(Request):
+class Place(RequestBody):
     """Measured point, as an answer of the server gave it."""
 
     position_in_geo: Triple
@@ -85,7 +85,7 @@ class Place(Request):
 _LEAST: dict[Kind, int] = {"point": 1, "distance": 2, "polyline": 2, "area": 3, "volume": 3, "profile": 2}
 
 
-class MeasureRequest(Request):
+class MeasureRequest(RequestBody):
     """Measurement to make."""
 
     kind: Kind
@@ -101,20 +101,20 @@ class MeasureRequest(Request):
         return self
 
 
-class SaveRequest(Request):
+class SaveRequest(RequestBody):
     """Finished measurement to save, by the number of its job."""
 
     job: Index
     name: Name
 
 
-class NamedRequest(Request):
+class NamedRequest(RequestBody):
     """Name of a saved measurement, or of a point."""
 
     name: Name
 
 
-class MarkRequest(Request):
+class MarkRequest(RequestBody):
     """Mark of a point to set; without a place, to remove."""
 
     point: Name
@@ -122,7 +122,7 @@ class MarkRequest(Request):
     place_px: tuple[Number, Number] | None
 
 
-class PointRequest(Request):
+class PointRequest(RequestBody):
     """Point to make, or to change; without coordinates, it is not surveyed."""
 
     name: Name
@@ -130,16 +130,16 @@ class PointRequest(Request):
     is_check: bool = False
 
 
-class ProposalRequest(Request):
+class ProposalRequest(RequestBody):
     """Point for which to search marks."""
 
     point: Name
 
 
-class SeenRequest(Request):
+class SeenRequest(RequestBody):
     """Place in `geo` whose photographs are asked for."""
 
     position_in_geo: Triple
 
-    def place(self) -> FloatArray:
+    def position(self) -> FloatArray:
         return np.array(self.position_in_geo)

@@ -21,7 +21,14 @@ from pipelines.core.lock import WriteLock
 from pipelines.core.stages import SAVED_MEASUREMENTS
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import Json, feature, features_text, replacing_features_gpkg
-from pipelines.survey.saved_measurements import CLOSED, MEASUREMENTS, Kind, NamedMeasurement, read_measurements
+from pipelines.survey.saved_measurements import (
+    CLOSED,
+    MEASUREMENTS,
+    Kind,
+    NamedMeasurement,
+    SavedPoint,
+    read_measurements,
+)
 
 FOLDER = Path(SAVED_MEASUREMENTS).parent.name  # of the workspace: what the user saves in the viewer
 _PATIENCE_S = 5.0  # for another viewer, which holds the folder for the time of one write
@@ -132,8 +139,7 @@ def tables_of(measurements: Sequence[NamedMeasurement]) -> dict[str, str]:
         heads = [f"{name}{part}" for name in names for part in ("", " sigma", " unit")]
         lines: list[Sequence[object]] = [["name", "wkt", "crs", *_PLACE, *heads]]
         for each in rows:
-            first = each.points[0]
-            place = (*first.xyz, *(first.sigma_m or ("", "", ""))) if kind == "point" else ("",) * 6
+            place = _place(each.points[0]) if kind == "point" else ("",) * len(_PLACE)
             found = {quantity.name: quantity for quantity in each.quantities}
             values: list[object] = []
             for one in map(found.get, names):
@@ -143,6 +149,11 @@ def tables_of(measurements: Sequence[NamedMeasurement]) -> dict[str, str]:
             lines.append([each.name, _wkt(each), each.crs, *place, *values])
         tables[file] = table_text(lines)
     return tables
+
+
+def _place(point: SavedPoint) -> tuple[object, ...]:
+    """Return the cells of the columns `_PLACE`; those of an unknown σ are empty."""
+    return (*point.xyz, *(point.sigma_m or ("", "", "")))
 
 
 def _wkt(measurement: NamedMeasurement) -> str:

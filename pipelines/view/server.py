@@ -34,7 +34,7 @@ from pipelines.view.exports import profile_file
 from pipelines.view.options import ViewOptions
 from pipelines.view.saved import FILES
 from pipelines.view.viewer import Viewer, jpeg_of, model_stamp
-from pipelines.view.work import Job
+from pipelines.view.work import ViewJob
 
 log = logging.getLogger(__name__)
 
@@ -121,7 +121,9 @@ def _bound(port: int) -> tuple[list[Any], int]:
                 taken = "Port %d is taken: the viewer uses port %d."
                 log.warning(taken, port, candidate, extra={"code": "port-taken"})
             return sockets, candidate
-    raise GeorefError("no-free-port", f"Ports {port} to {port + _PORTS - 1} are taken. Give another --port.")
+    raise GeorefError(
+        "no-free-port", f"Ports {port} to {port + _PORTS - 1} are taken.", remedy="Give another --port."
+    )
 
 
 def _status(port: int, path: str, headers: dict[str, str]) -> int:
@@ -338,7 +340,7 @@ class _BadRequestError(Exception):
     """A request that no page of the viewer makes."""
 
 
-def _job_json(job: Job) -> dict[str, Any]:
+def _job_json(job: ViewJob) -> dict[str, Any]:
     return {name: getattr(job, name) for name in ("number", "state", "share", "answer", "failure")}
 
 

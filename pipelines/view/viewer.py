@@ -19,14 +19,13 @@ from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.report.page import limited
-from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.picking import NoSurface, SurfacePoint
-from pipelines.surface.surface_views import ModelRenderer
+from pipelines.surface.surface_views import ModelRenderer, model_renderer
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import mark_rays, wrong_marks
 from pipelines.survey.saved_measurements import NamedMeasurement, Quantity, SavedPoint, new_id
-from pipelines.survey.scene import photographs
+from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.survey.survey import SurveyedPoint
-from pipelines.survey.trained_survey import load_trained
 from pipelines.view import requests
 from pipelines.view.mark_views import epipolar_lines, proposals
 from pipelines.view.marking import (
@@ -45,7 +44,7 @@ from pipelines.view.pictures import PageView, Painter, Photographs, frame_of
 from pipelines.view.pointing import pointing_covariance
 from pipelines.view.quantities import Profile, distances, length
 from pipelines.view.saved import FOLDER, SavedMeasurements
-from pipelines.view.work import Job, Jobs
+from pipelines.view.work import Jobs, ViewJob
 
 Json = dict[str, Any]
 _PIXEL_MARGIN = 0.02  # of a photograph: nearer to its rim a place is seen badly
@@ -64,28 +63,24 @@ class Viewer:
         self.stamp = model_stamp(workspace)
         self._workspace = workspace
         with progress.task("reading the model", 2) as task:
-            trained = load_trained(workspace)
+            solution = read_trained(workspace)
+            sfm, survey = read_sfm(workspace, solution), solution.weighted(load_survey(workspace))
             task.advance()
-            images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-            backend = rasterizer(options.backend, progress, mip_filter=trained.model.mip_filter)
-            renderer = ModelRenderer(trained, images, backend)
-            self.model = MeasuringModel(workspace, renderer, options)
+            renderer = model_renderer(workspace, solution, sfm, survey, backend=options.backend, progress=progress)
+            self.model = MeasuringModel(workspace, survey, renderer, options)
             task.advance()
-        self.trained, self.frame = trained, frame_of(trained)
-        self.photographs = Photographs(workspace, trained)
+        self.solution, self.sparse, self.frame = solution, renderer.sparse, frame_of(solution, sfm)
+        self.photographs, self.survey = Photographs(workspace, survey, self.sparse), survey
         grid = None if self.model.posterior is None else self.model.posterior.grid
-        self._painter = Painter(
-            lambda shown: renderer if shown is trained else ModelRenderer(shown, images, backend),
-            self.photographs, trained, self.frame, grid,
-        )  # fmt: skip
+        self._painter = Painter(renderer, self.photographs, self.frame, grid)
         self._hash, self.jobs, self._lock = hash_file(workspace.path(MODEL), {}), Jobs(), threading.RLock()
         folder = workspace.root / FOLDER
         self.saved = SavedMeasurements(folder)
         self.marks = KeptMarks(
-            folder, points_to_mark(trained.survey, self._xyz_of), self.model.target.crs.lla_from_xyz,
+            folder, points_to_mark(survey, self._xyz_of), self.model.target.crs.lla_from_xyz,
             self.model.target.crs.xyz_from_lla,
         )  # fmt: skip
-        self._surveyed = {p.name: p for p in (*trained.survey.control_points, *trained.survey.check_points)}
+        self._surveyed = {p.name: p for p in (*survey.control_points, *survey.check_points)}
         self._scene = described_scene(workspace, self.model, self.frame)
         # The Gaussians are sorted now, so that the first click does not wait.
         self._ended = threading.Event()
@@ -126,10 +121,10 @@ class Viewer:
 
     def seen_by(self, request: requests.SeenRequest) -> list[Json]:
         """Return the photographs that see a place, the best first: fine pixels, and away from their rim."""
-        place, found = request.place(), []
-        centers = self.trained.geo_from_model.apply(self.trained.poses.cam_center_in_model)
-        for camera, pixel in appears_in(place, self.trained):
-            lens, away = self.trained.sparse.camera_of(camera), centers[camera] - place
+        place, found = request.position(), []
+        centers = self.solution.center_in_geo
+        for camera, pixel in appears_in(place, self.solution, self.sparse):
+            lens, away = self.sparse.camera_of(camera), centers[camera] - place
             size, away_m = np.array([lens.width, lens.height]), float(np.linalg.norm(away))
             gsd_m = away_m / lens.mean_focal_px
             rim = float(np.min(np.minimum(pixel, size - pixel) / size))
@@ -139,11 +134,13 @@ class Viewer:
         return [each for _, each in sorted(found, key=lambda each: each[0])[:_MOST_SEEN]]
 
     def name_of(self, camera: int) -> str:
-        return self.trained.sparse.image_name[camera]
+        return self.sparse.image_name[camera]
 
     def _known(self, camera: int) -> None:
-        if camera >= len(self.trained.sparse.image_name):
-            raise InputError("no-such-photograph", f"There is no photograph {camera}. Load the page again.")
+        if camera >= len(self.sparse.image_name):
+            raise InputError(
+                "no-such-photograph", f"There is no photograph {camera}.", remedy="Load the page again."
+            )
 
     # Measuring
 
@@ -159,14 +156,16 @@ class Viewer:
         """Return a surveyed point as its marks show it on the rendered surface, with its surveyed place."""
         point = self._surveyed.get(name)
         if point is None:
-            raise InputError("no-such-point", f"There is no surveyed point {name!r}. Load the page again.")
-        rays = mark_rays((point,), self.trained.sparse)
+            raise InputError(
+                "no-such-point", f"There is no surveyed point {name!r}.", remedy="Load the page again."
+            )
+        rays = mark_rays((point,), self.sparse)
         found = self._measured(self.model.reader.behind_marks(rays))
         return {**found, "surveyed": self.model.target.xyz_from_geo(np.array([point.position_in_geo]))[0].tolist()}
 
     def marked(self, name: str) -> Json:
         """Return a marked point, triangulated."""
-        rays = rays_of(self._point(name), self.trained)
+        rays = rays_of(self._point(name), self.sparse)
         place, cov = self.model.triangulated(rays)
         if not np.isfinite(place).all():
             return {"reason": f"{name} has fewer than two marks"}
@@ -175,7 +174,7 @@ class Viewer:
     def _measured(self, point: SurfacePoint | NoSurface) -> Json:
         if isinstance(point, NoSurface):
             return {"reason": point.reason}
-        xyz, sigma_m = self.model.place(point)
+        xyz, sigma_m = self.model.coordinates(point)
         return {
             "point": {
                 "position_in_geo": point.position_in_geo.tolist(),
@@ -186,13 +185,13 @@ class Viewer:
             "sigma_m": None if sigma_m is None else sigma_m.tolist(),
         }
 
-    def measure(self, request: requests.MeasureRequest) -> Job:
+    def measure(self, request: requests.MeasureRequest) -> ViewJob:
         """Begin a measurement; its answer has quantities, and of a profile the heights."""
         for camera in {camera for place in request.points for camera in place.cameras}:
             self._known(camera)
         return self.jobs.begin(request, lambda job: self._answers(job, request))
 
-    def _answers(self, job: Job, request: requests.MeasureRequest) -> Iterator[Json]:
+    def _answers(self, job: ViewJob, request: requests.MeasureRequest) -> Iterator[Json]:
         points, kind = [place.point() for place in request.points], request.kind
         if kind == "point":
             yield {"quantities": []}
@@ -217,7 +216,7 @@ class Viewer:
         job = self.jobs.find(request.job)
         if job is None or job.state != "done" or not isinstance(job.request, requests.MeasureRequest):
             raise InputError(
-                "measurement-unfinished", "The measurement is not finished. Measure it again, then save."
+                "measurement-unfinished", "The measurement is not finished.", remedy="Measure it again, then save."
             )
         quantities = tuple(Quantity(**each) for each in job.answer["quantities"])
         with self._lock:
@@ -235,8 +234,8 @@ class Viewer:
         return self.measurements()
 
     def _saved_point(self, point: SurfacePoint) -> SavedPoint:
-        xyz, sigma_m = self.model.place(point)
-        origin = self.trained.survey.origin
+        xyz, sigma_m = self.model.coordinates(point)
+        origin = self.survey.origin
         lla = None if origin is None else lla_from_enu(point.position_in_geo[None], origin)[0].tolist()
         return SavedPoint.model_validate(
             {
@@ -251,7 +250,7 @@ class Viewer:
 
     def measurements(self) -> list[Json]:
         """Return the saved measurements, also those of other viewers."""
-        number = {name: camera for camera, name in enumerate(self.trained.sparse.image_name)}
+        number = {name: camera for camera, name in enumerate(self.sparse.image_name)}
         with self._lock:
             self.saved.read()
             return [
@@ -283,13 +282,15 @@ class Viewer:
         """Return a file of saved measurements; an InputError: there is none."""
         path = self._workspace.root / FOLDER / name
         if not path.is_file():
-            raise InputError("nothing-saved", f"There is no {name} yet. Save a measurement first.")
+            raise InputError("nothing-saved", f"There is no {name} yet.", remedy="Save a measurement first.")
         return path.read_bytes()
 
     def _saved(self, identity: str) -> NamedMeasurement:
         found = next((each for each in self.saved.all if each.id == identity), None)
         if found is None:
-            raise InputError("no-such-measurement", "The measurement was removed meanwhile. Load the page again.")
+            raise InputError(
+                "no-such-measurement", "The measurement was removed meanwhile.", remedy="Load the page again."
+            )
         return found
 
     # Marking
@@ -305,7 +306,7 @@ class Viewer:
             points = self.marks.points
         wrong = {
             (mark.point, mark.image): mark.off_px
-            for mark in wrong_marks([surveyed_marks(point) for point in points], self.trained.sparse)
+            for mark in wrong_marks([surveyed_marks(point) for point in points], self.sparse)
         }
         return {
             "is_written": self.marks.is_written,
@@ -316,10 +317,10 @@ class Viewer:
         good = MarkedPoint(point.name, point.xyz, point.is_check, {
             image: place for image, place in point.marks.items() if (point.name, image) not in wrong
         })  # fmt: skip
-        place, cov = self.model.triangulated(rays_of(good, self.trained))
-        rays, off = rays_of(point, self.trained), {}
+        place, cov = self.model.triangulated(rays_of(good, self.sparse))
+        rays, off = rays_of(point, self.sparse), {}
         if np.isfinite(place).all():
-            errors = residuals_px(place, rays, self.trained)
+            errors = residuals_px(place, rays, self.solution)
             off = {
                 self.name_of(int(camera)): float(error) for camera, error in zip(rays.camera, errors, strict=True)
             }
@@ -345,7 +346,7 @@ class Viewer:
 
     def expected(self, point: MarkedPoint) -> FloatArray | None:
         """Return where a point must be (3,) in `geo`: by its marks, or by its survey; None: neither tells."""
-        by_marks, _ = self.model.triangulated(rays_of(point, self.trained))
+        by_marks, _ = self.model.triangulated(rays_of(point, self.sparse))
         if np.isfinite(by_marks).all():
             return by_marks
         if point.xyz is None:
@@ -355,7 +356,9 @@ class Viewer:
     def _point(self, name: str) -> MarkedPoint:
         point = next((point for point in self.marks.points if point.name == name), None)
         if point is None:
-            raise InputError("no-such-point", f"There is no point {name!r} any more. Load the page again.")
+            raise InputError(
+                "no-such-point", f"There is no point {name!r} any more.", remedy="Load the page again."
+            )
         return point
 
     def in_photographs(self, name: str) -> list[Json]:
@@ -363,16 +366,16 @@ class Viewer:
         point = self._point(name)
         place = self.expected(point)
         if place is None:
-            shown: list[tuple[int, Any]] = [(camera, None) for camera in range(len(self.trained.sparse.image_name))]
+            shown: list[tuple[int, Any]] = [(camera, None) for camera in range(len(self.sparse.image_name))]
         else:
-            shown = [(camera, pixel.tolist()) for camera, pixel in appears_in(place, self.trained)]
+            shown = [(camera, pixel.tolist()) for camera, pixel in appears_in(place, self.solution, self.sparse)]
         return [
             {
                 "camera": camera,
                 "image": self.name_of(camera),
                 "px": pixel,
                 "mark": point.marks.get(self.name_of(camera)),
-                "size": [self.trained.sparse.camera_of(camera).width, self.trained.sparse.camera_of(camera).height],
+                "size": [self.sparse.camera_of(camera).width, self.sparse.camera_of(camera).height],
             }
             for camera, pixel in shown
         ]
@@ -381,18 +384,20 @@ class Viewer:
         """Return the epipolar lines of a point's marks in a photograph."""
         self._known(camera)
         point = self._point(name)
-        lines = epipolar_lines(self.trained, point, camera, self.expected(point))
+        lines = epipolar_lines(self.solution, self.sparse, point, camera, self.expected(point))
         return [{"image": image, "px": np.round(line, 2).tolist()} for image, line in lines]
 
     def set_mark(self, request: requests.MarkRequest) -> Json:
         """Set or remove a mark; an InputError: it is outside its photograph."""
-        names = self.trained.sparse.image_name
+        names = self.sparse.image_name
         if request.place_px is not None:
             if request.image not in names:
                 raise InputError(
-                    "no-such-photograph", f"The model has no photograph {request.image}. Load the page again."
+                    "no-such-photograph",
+                    f"The model has no photograph {request.image}.",
+                    remedy="Load the page again.",
                 )
-            lens = self.trained.sparse.camera_of(names.index(request.image))
+            lens = self.sparse.camera_of(names.index(request.image))
             x, y = request.place_px
             if not (0 <= x <= lens.width and 0 <= y <= lens.height):
                 raise InputError("mark-outside", "This place is outside the photograph.")
@@ -418,11 +423,11 @@ class Viewer:
             raise InputError("nothing-to-write", "No point has both coordinates and marks: nothing to write.")
         return {"files": [str(file) for file in files], "heights": self.model.target.crs.vertical.described}
 
-    def propose(self, request: requests.ProposalRequest) -> Job:
+    def propose(self, request: requests.ProposalRequest) -> ViewJob:
         """Begin the search for marks of a point in further photographs."""
         point = self._point(request.point)
 
-        def work(job: Job) -> Iterator[list[Json]]:
+        def work(job: ViewJob) -> Iterator[list[Json]]:
             place = self.expected(point)
             if place is None or not point.marks:
                 raise InputError(
@@ -430,7 +435,9 @@ class Viewer:
                 )
             found: list[Json] = []
             yield found
-            for each in proposals(self.trained, point, place, self.photographs.full, job.advance):
+            for each in proposals(
+                self.solution, self.sparse, point, place, self.photographs.full, advance=job.advance
+            ):
                 found = [*found, asdict(each)]
                 yield found
 
@@ -442,6 +449,8 @@ def _answer(quantities: tuple[Quantity, ...]) -> Json:
 
 
 def profile_json(line: Profile) -> Json:
+    """Return a profile for the page: distances along it and heights with σ, null where none is measured."""
+
     def listed(values: FloatArray) -> list[float | None]:
         return [None if not np.isfinite(value) else round(float(value), 5) for value in values]
 
@@ -454,6 +463,7 @@ def profile_json(line: Profile) -> Json:
 
 
 def jpeg_of(rgb: Any, quality: int) -> bytes:
+    """Return a picture (H, W, 3) of bytes, red first, as JPEG of a quality from 0 to 100."""
     _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return encoded.tobytes()
 

@@ -21,7 +21,7 @@ class CancelledError(Exception):
 
 
 @dataclass
-class Job:
+class ViewJob:
     """Work for a page.
 
     Attributes:
@@ -51,21 +51,21 @@ class Jobs:
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(_THREADS, thread_name_prefix="measure")
-        self._jobs: OrderedDict[int, Job] = OrderedDict()
+        self._jobs: OrderedDict[int, ViewJob] = OrderedDict()
         self._lock = threading.Lock()
         self._last = 0
 
-    def begin(self, request: Any, work: Callable[[Job], Iterable[Any]]) -> Job:
+    def begin(self, request: Any, work: Callable[[ViewJob], Iterable[Any]]) -> ViewJob:
         """Begin a job whose work yields answers, each better than the one before."""
         with self._lock:
             self._last += 1
-            job = self._jobs[self._last] = Job(self._last, request)
+            job = self._jobs[self._last] = ViewJob(self._last, request)
             while len(self._jobs) > _KEPT:
                 self._jobs.popitem(last=False)[1].cancelled.set()
         self._pool.submit(self._run, job, work)
         return job
 
-    def find(self, number: int) -> Job | None:
+    def find(self, number: int) -> ViewJob | None:
         with self._lock:
             return self._jobs.get(number)
 
@@ -76,7 +76,7 @@ class Jobs:
         self._pool.shutdown(cancel_futures=True)
 
     @staticmethod
-    def _run(job: Job, work: Callable[[Job], Iterable[Any]]) -> None:
+    def _run(job: ViewJob, work: Callable[[ViewJob], Iterable[Any]]) -> None:
         try:
             for answer in work(job):
                 job.answer = answer

@@ -32,6 +32,7 @@ from tests import bags
 from tests.earth import enu_from_lla
 from tests.scenes import Noise, TrueScene, sparse_model
 
+pytestmark = pytest.mark.usefixtures("children_here")  # a model is taken over in each test
 OFFSET_S, BORESIGHT_DEG = 0.2, np.array([0.7, -0.5, 0.4])
 EXACT = Noise(pixel_px=0.05)
 SIZE = (1200, 900)  # of the photographs in the bags, and of the cameras of `sparse_model`
@@ -70,7 +71,7 @@ def write_model(
 ) -> Path:
     """What SfM would make of cameras (n, 3) and (n, 3, 3) above a landscape, in a frame of its own."""
     rng = np.random.default_rng(0)
-    land = np.column_stack([rng.uniform(-150, 150, (1500, 2)), rng.uniform(0, 15, 1500)])
+    land = np.column_stack([rng.uniform(-150, 150, (600, 2)), rng.uniform(0, 15, 600)])
     scene = TrueScene(centers, geo_from_cam, land, np.empty((0, 3)))
     model = sparse_model(scene, EXACT, rng)
     camera = model.cameras[1]
@@ -108,6 +109,12 @@ def flown(path: Path, flight: bags.Flight) -> dict[str, Path]:
     return {"--bag": bags.write(path / "bag", messages), "--import": model}
 
 
+@pytest.fixture(scope="module")
+def winding(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Inputs of a flight that shows time offset and boresight, which nobody changes."""
+    return flown(tmp_path_factory.mktemp("winding"), Winding(count=24))
+
+
 def arguments(inputs: dict[str, Path]) -> list[object]:
     return [part for pair in inputs.items() for part in pair]
 
@@ -127,9 +134,9 @@ def missed(workspace: Path, flight: bags.Flight) -> tuple[np.ndarray, np.ndarray
     return positions - truth, np.degrees(np.linalg.norm(turned, axis=1))
 
 
-def test_run_estimates_after_sfm_and_goes_on(tmp_path: Path, command: Command) -> None:
+def test_run_estimates_after_sfm_and_goes_on(tmp_path: Path, command: Command, winding: dict[str, Path]) -> None:
     flight, workspace = Winding(count=24), tmp_path / "ws"
-    asked = [*arguments(flown(tmp_path, flight)), "--time-offset", "auto", "--estimate", "boresight"]
+    asked = [*arguments(winding), "--time-offset", "auto", "--estimate", "boresight"]
     document = command("run", workspace, *asked, "--to", "init-sim3")
     stages = {row["stage"]: row for row in document["stages"]}
     assert list(stages) == [spec.name for spec in stage_slice(None, "init-sim3")]
@@ -159,10 +166,11 @@ def test_run_estimates_after_sfm_and_goes_on(tmp_path: Path, command: Command) -
 
 
 @pytest.mark.slow
-def test_ingest_made_again_keeps_sfm_and_is_calibrated_again(tmp_path: Path, command: Command) -> None:
-    flight, workspace = Winding(count=24), tmp_path / "ws"
-    inputs = flown(tmp_path, flight)
-    command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
+def test_ingest_made_again_keeps_sfm_and_is_calibrated_again(
+    tmp_path: Path, command: Command, winding: dict[str, Path]
+) -> None:
+    workspace = tmp_path / "ws"
+    command("run", workspace, *arguments(winding), "--time-offset", "auto", "--to", "geolocate")
     before, rig = load_survey(Workspace(workspace)), load_json(RigCalibration, workspace / RIG)
     document = command("run", workspace, "--sigma-h", 0.5, "--test-every", 5, "--to", "geolocate")
     made = {row["stage"]: row["ran"] for row in document["stages"]}
@@ -191,10 +199,11 @@ def test_flight_that_shows_nothing_is_told_and_no_failure(tmp_path: Path, comman
     assert not any(row["ran"] for row in again["stages"])
 
 
-def test_calibrate_and_apply(tmp_path: Path, command: Command, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_and_apply(
+    tmp_path: Path, command: Command, capsys: pytest.CaptureFixture[str], winding: dict[str, Path]
+) -> None:
     flight, workspace = Winding(count=24), tmp_path / "ws"
-    inputs = flown(tmp_path, flight)
-    document = command("run", workspace, *arguments(inputs), "--to", "geolocate")
+    document = command("run", workspace, *arguments(winding), "--to", "geolocate")
     figures = {row["stage"]: row["key_figure"] for row in document["stages"]}
     assert figures["calibrate"] == "nothing to estimate"
     before = load_json(Survey, workspace / SURVEY)
@@ -218,12 +227,18 @@ def test_calibrate_and_apply(tmp_path: Path, command: Command, capsys: pytest.Ca
     assert boundary.guarded(cli, ["calibrate", str(workspace), "--estimate", "lever-arm"]) == 0
     table = capsys.readouterr().out
     assert "lever-arm forward" in table and "control points" in table
+    # A workspace without navigation by time
+    (workspace / "ingest/track.npz").unlink()
+    message = command("calibrate", workspace, "--estimate", "boresight", fails=True)
+    assert "track.npz" in message and "--trajectory" in message
 
 
 @pytest.mark.slow
-def test_what_ingest_asked_for_can_be_left_unapplied(tmp_path: Path, command: Command) -> None:
-    inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
-    command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "calibrate")
+def test_what_ingest_asked_for_can_be_left_unapplied(
+    tmp_path: Path, command: Command, winding: dict[str, Path]
+) -> None:
+    workspace = tmp_path / "ws"
+    command("run", workspace, *arguments(winding), "--time-offset", "auto", "--to", "calibrate")
     values = command("calibrate", workspace, "--no-apply")["values"]
     assert [row["name"] for row in values["estimates"]] == ["time-offset"] and values["applied"] == []
     assert load_survey(Workspace(workspace)) == load_json(Survey, workspace / SURVEY)
@@ -233,10 +248,12 @@ def test_what_ingest_asked_for_can_be_left_unapplied(tmp_path: Path, command: Co
 
 
 @pytest.mark.slow
-def test_a_comparison_reads_the_calibration_where_it_is(tmp_path: Path, command: Command) -> None:
+def test_a_comparison_reads_the_calibration_where_it_is(
+    tmp_path: Path, command: Command, winding: dict[str, Path]
+) -> None:
     """Configurations share the stages up to geolocate, and are stale with what these apply."""
-    inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
-    command("run", workspace, *arguments(inputs), "--time-offset", "auto", "--to", "geolocate")
+    workspace = tmp_path / "ws"
+    command("run", workspace, *arguments(winding), "--time-offset", "auto", "--to", "geolocate")
     root = Workspace(workspace)
     lent = {spec.folder: workspace / spec.folder for spec in stage_slice(None, "geolocate")}
     variant = Workspace(workspace / "compare/A", root, lent, "compare")
@@ -250,7 +267,7 @@ def test_a_comparison_reads_the_calibration_where_it_is(tmp_path: Path, command:
 
 
 def test_stages_one_by_one_are_reminded(tmp_path: Path, command: Command) -> None:
-    inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
+    inputs, workspace = flown(tmp_path, Winding(count=8)), tmp_path / "ws"
     command("ingest", workspace, "--bag", inputs["--bag"], "--time-offset", "auto")
     command("sfm", workspace, "--import", inputs["--import"])
     message = command("geolocate", workspace)["err"]
@@ -270,14 +287,6 @@ def test_what_cannot_be_estimated_is_said_before_sfm(tmp_path: Path, command: Co
     empty = bags.write(tmp_path / "empty", bags.images(flight))
     message = command("ingest", tmp_path / "ws", "--bag", empty, "--time-offset", "auto", fails=True)
     assert "No image has a position" in message and "--gcp" in message
-
-
-def test_workspace_without_navigation_by_time(tmp_path: Path, command: Command) -> None:
-    inputs, workspace = flown(tmp_path, Winding(count=24)), tmp_path / "ws"
-    command("run", workspace, *arguments(inputs), "--to", "sfm")
-    (workspace / "ingest/track.npz").unlink()
-    message = command("calibrate", workspace, "--estimate", "boresight", fails=True)
-    assert "track.npz" in message and "--trajectory" in message
 
 
 def test_wanted_is_checked() -> None:

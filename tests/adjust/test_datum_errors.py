@@ -9,8 +9,9 @@ import pytest
 
 from pipelines.adjust.alignment import Correspondences, align
 from pipelines.adjust.geolocate import geolocate
-from pipelines.adjust.init_sim3 import Estimated, estimate_similarity
+from pipelines.adjust.init_sim3 import estimate_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
+from pipelines.adjust.posterior import Posterior
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
@@ -29,9 +30,10 @@ def drawn(measured: Measured) -> tuple[Survey, SparseModel]:
     return survey_of(scene, Noise(), measured, rng), sparse_model(scene, Noise(), rng)
 
 
-def solved(survey: Survey, model: SparseModel) -> Estimated:
+def solved(survey: Survey, model: SparseModel) -> Posterior:
     points = geolocate(survey, model, GeolocateOptions()).points
-    return estimate_similarity(survey, model, points, InitSim3Options())
+    posterior, _ = estimate_similarity(survey, model, points, InitSim3Options())
+    return posterior
 
 
 def session(datum: tuple[float, float, float]) -> FixSession:
@@ -48,18 +50,18 @@ def test_the_accuracy_of_the_transformation_of_control_points_is_in_every_absolu
     datum = (AXIS_M, AXIS_M, 0.0)
     sessions = (session(datum),) if fixes else ()
     coarse = solved(survey.model_copy(update={"sigma_datum_m": datum, "sessions": sessions}), model)
-    for one, least in ((plain, 0.0), (coarse, TRANSFORMATION_M)):
-        accuracy = one.posterior.solution.accuracy
+    for posterior, least in ((plain, 0.0), (coarse, TRANSFORMATION_M)):
+        accuracy = posterior.solution.accuracy
         assert accuracy is not None and accuracy.rms_sigma_h_m is not None
         # RTK and control of centimetres: what is beyond is that of the transformation alone.
         assert least <= accuracy.rms_sigma_h_m < least + 0.1
-        of_similarity = np.array(one.initial.geo_from_local.covariance)[4:, 4:]
+        of_similarity = np.array(posterior.solution.geo_from_model.covariance)[4:, 4:]
         assert least <= np.sqrt(np.trace(of_similarity[:2, :2])) < least + 0.1
-        cameras = np.sqrt(one.posterior.camera_cov[:, 3, 3] + one.posterior.camera_cov[:, 4, 4])
+        cameras = np.sqrt(posterior.camera_cov[:, 3, 3] + posterior.camera_cov[:, 4, 4])
         assert ((least <= cameras) & (cameras < least + 0.2)).all()
     # The heights have no part in it, and neither have differences: control points keep their place.
-    assert coarse.posterior.solution.accuracy.rms_sigma_v_m < 0.1
-    moved = Similarity.from_record(coarse.initial.geo_from_local) @ GEO_FROM_LOCAL.inverse()
+    assert coarse.solution.accuracy.rms_sigma_v_m < 0.1
+    moved = Similarity.from_record(coarse.solution.similarity_from_local()) @ GEO_FROM_LOCAL.inverse()
     assert np.linalg.norm(moved.apply(np.zeros((1, 3)))) < 0.1
 
 
@@ -68,13 +70,13 @@ def test_heights_of_an_assumed_datum_have_its_sigma() -> None:
     assumed = solved(survey.model_copy(update={"sessions": (session((0.0, 0.0, 50.0)),)}), model)
     stated = solved(survey.model_copy(update={"sessions": (session((0.0, 0.0, 0.0)),)}), model)
     for one, least in ((assumed, 50.0), (stated, 0.0)):
-        accuracy = one.posterior.solution.accuracy
+        accuracy = one.solution.accuracy
         assert accuracy is not None and accuracy.rms_sigma_v_m is not None and accuracy.rms_sigma_h_m is not None
         assert 0.99 * least <= accuracy.rms_sigma_v_m < least + 0.2 and accuracy.rms_sigma_h_m < 0.2
     # Control points with heights decide: nothing of it is left.
     survey, model = drawn(Measured(gcps=True))
     decided = solved(survey.model_copy(update={"sessions": (session((0.0, 0.0, 50.0)),)}), model)
-    assert decided.posterior.solution.accuracy.rms_sigma_v_m < 0.1
+    assert decided.solution.accuracy.rms_sigma_v_m < 0.1
 
 
 def with_zero(survey: Survey, shift_m: float, sigma_m: float) -> Survey:
@@ -92,23 +94,23 @@ def with_zero(survey: Survey, shift_m: float, sigma_m: float) -> Survey:
 
 def test_heights_from_an_unknown_zero_level_the_survey_and_state_no_height() -> None:
     survey, model = drawn(Measured())
-    found = solved(with_zero(survey, -1620.0, 1000.0), model)
-    accuracy = found.posterior.solution.accuracy
+    posterior = solved(with_zero(survey, -1620.0, 1000.0), model)
+    accuracy = posterior.solution.accuracy
     assert accuracy is not None
     headline = predicted(accuracy, ())
     assert headline.rmse_v_m is None and headline.rmse_h_m is not None and headline.rmse_h_m < 0.2
     assert "V unknown" in headline.text
     # Fixes of centimetres against each other level an orbit of tens of metres to a tenth of a degree.
-    sigma = np.sqrt(np.diag(np.array(found.initial.geo_from_local.covariance)))
+    sigma = np.sqrt(np.diag(np.array(posterior.solution.geo_from_model.covariance)))
     assert np.degrees(sigma[1:3]).max() < 0.1
 
 
 def test_control_points_decide_heights_from_an_unknown_zero() -> None:
     survey, model = drawn(Measured(gcps=True))
-    found = solved(with_zero(survey, -2470.0, 2470.0), model)
-    away = Similarity.from_record(found.initial.geo_from_local) @ GEO_FROM_LOCAL.inverse()
+    solution = solved(with_zero(survey, -2470.0, 2470.0), model).solution
+    away = Similarity.from_record(solution.similarity_from_local()) @ GEO_FROM_LOCAL.inverse()
     assert np.linalg.norm(away.apply(np.zeros((1, 3)))) < 0.15
-    assert found.initial.gnss_outliers == () and found.initial.control_outliers == ()
+    assert solution.gnss_outliers == () and solution.control_outliers == ()
 
 
 def grid(across: float) -> Correspondences:
@@ -144,10 +146,10 @@ def test_check_points_show_an_assumed_datum_and_not_the_transformation_that_they
     rays = mark_rays(check, model)
     place = np.array([point.position_in_geo for point in check])
     by_control = {"control_points": survey.control_points[3:], "sigma_datum_m": (AXIS_M, AXIS_M, 0.0)}
-    shared = solved(survey.model_copy(update=by_control), model).posterior
+    shared = solved(survey.model_copy(update=by_control), model)
     assert np.sqrt(shared.of_marked_points(place, rays)[:, 0, 0]).max() < 0.1
     by_fixes = {"control_points": (), "sessions": (session((0.0, 0.0, 50.0)),)}
-    shown = solved(survey.model_copy(update=by_fixes), model).posterior
+    shown = solved(survey.model_copy(update=by_fixes), model)
     assert np.sqrt(shown.of_marked_points(place, rays)[:, 2, 2]) == pytest.approx(50.0, abs=0.1)
     joint = shown.jointly_of_marked_points(place, rays)
     # All points share it: their differences are as good as before.

@@ -2,7 +2,8 @@
 
 The measurements and the report are those of the Damped Bundle Adjustment Toolbox (Börlin and Grussenmeyer), folder
 `data/script/sxb`. They are not part of this repository: the test needs a folder of survey data, named by
-GEOREF_DATA, with `dbat_sxb` in it. `pytest tests/adjust/test_dbat.py -s` prints the table of docs/accuracy.md.
+GEOREF_DATA, with `dbat_sxb` in it. `pytest tests/adjust/test_dbat.py -s` prints the table of
+examples/benchmarks/results/accuracy.md.
 """
 
 from __future__ import annotations

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from pipelines.adjust.geolocate import geolocate
-from pipelines.adjust.init_sim3 import Estimated, estimate_similarity
+from pipelines.adjust.init_sim3 import estimate_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
+from pipelines.adjust.posterior import Posterior
+from pipelines.core.products import Remark
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.survey import KnownDistance, PointMarks, Survey, SurveyedPoint
 from tests.drawn_surveys import Receiver, drawn, flight, missed, surveyed
@@ -37,12 +39,12 @@ def survey_of(rng: np.random.Generator) -> Survey:
     return survey.model_copy(update={"distances": tuple(distances)})
 
 
-def solved(survey: Survey) -> Estimated:
+def solved(survey: Survey) -> tuple[Posterior, tuple[Remark, ...]]:
     points = geolocate(survey, FLIGHT.model, GeolocateOptions()).points
     return estimate_similarity(survey, FLIGHT.model, points, InitSim3Options())
 
 
-def lengths(estimated: Estimated, survey: Survey) -> tuple[np.ndarray, np.ndarray]:
+def lengths(posterior: Posterior, survey: Survey) -> tuple[np.ndarray, np.ndarray]:
     """Errors of the distances between the last four check points, and their predicted σ."""
     held_out = survey.check_points[2 * BARS :]
     pairs = [bar(pair, 1.0) for pair in combinations(held_out, 2)]
@@ -50,13 +52,13 @@ def lengths(estimated: Estimated, survey: Survey) -> tuple[np.ndarray, np.ndarra
     true = np.array([end.position_in_geo for end in ends])
     found = (
         true
-        + missed(estimated.posterior, survey.model_copy(update={"check_points": tuple(held_out)}))[0][
+        + missed(posterior, survey.model_copy(update={"check_points": tuple(held_out)}))[0][
             [held_out.index(end) for end in ends]
         ]
     )
-    rays = mark_rays([end for pair in pairs for end in pair.ends], estimated.posterior.sparse)
+    rays = mark_rays([end for pair in pairs for end in pair.ends], posterior.sparse)
     length_m = [np.linalg.norm(place[::2] - place[1::2], axis=1) for place in (found, true)]
-    return length_m[0] - length_m[1], np.sqrt(estimated.posterior.of_distances(found, rays))
+    return length_m[0] - length_m[1], np.sqrt(posterior.of_distances(found, rays))
 
 
 def test_distances_set_the_scale_with_the_sigma_that_is_predicted() -> None:
@@ -64,18 +66,18 @@ def test_distances_set_the_scale_with_the_sigma_that_is_predicted() -> None:
     normalised, with_bars, without = [], [], []
     for seed in range(6):
         survey = survey_of(np.random.default_rng(seed))
-        estimated = solved(survey)
-        error, sigma = lengths(estimated, survey)
+        posterior, _ = solved(survey)
+        error, sigma = lengths(posterior, survey)
         normalised.append((error / sigma) ** 2)
-        with_bars.append(estimated.posterior.of_similarity[0, 0] ** 0.5)
-        states = [row for row in estimated.posterior.solution.measurements if row.kind == "distance"]
+        with_bars.append(posterior.of_similarity[0, 0] ** 0.5)
+        states = [row for row in posterior.solution.measurements if row.kind == "distance"]
         assert [row.used for row in states] == [True] * BARS and len(states[0].residual) == 1
         if not seed:
             alone = survey.model_copy(update={"distances": ()})
-            without.append(solved(alone).posterior.of_similarity[0, 0] ** 0.5)
+            without.append(solved(alone)[0].of_similarity[0, 0] ** 0.5)
             checks = tuple(one.model_copy(update={"use": "check"}) for one in survey.distances)
-            unused = solved(survey.model_copy(update={"distances": checks}))
-            assert unused.posterior.of_similarity[0, 0] ** 0.5 == pytest.approx(without[0], rel=1e-9)
+            unused, _ = solved(survey.model_copy(update={"distances": checks}))
+            assert unused.of_similarity[0, 0] ** 0.5 == pytest.approx(without[0], rel=1e-9)
     # Six draws of six pairs that share their points: the mean of the squares has a σ of about 0.3.
     assert 0.4 < np.mean(normalised) < 1.9
     assert np.mean(with_bars) < 0.1 * without[0]
@@ -85,11 +87,12 @@ def test_a_wrong_distance_is_named_and_not_used() -> None:
     survey = survey_of(np.random.default_rng(1))
     wrong = survey.distances[2]
     wrong = wrong.model_copy(update={"distance_m": wrong.distance_m + 0.5})
-    kept = solved(survey.model_copy(update={"distances": (*survey.distances[:2], wrong, *survey.distances[3:])}))
-    assert kept.initial.distance_outliers == (wrong.name,)
-    told = said(kept.warnings, "distance-outliers")
+    distances = (*survey.distances[:2], wrong, *survey.distances[3:])
+    kept, warnings = solved(survey.model_copy(update={"distances": distances}))
+    assert kept.solution.distance_outliers == (wrong.name,)
+    told = said(warnings, "distance-outliers")
     assert wrong.name in told and numbers(told)[-1] == pytest.approx(0.5, abs=0.06)
-    (row,) = (one for one in kept.posterior.solution.measurements if one.name == wrong.name)
+    (row,) = (one for one in kept.solution.measurements if one.name == wrong.name)
     assert not row.used
     error, sigma = lengths(kept, survey)
     assert np.abs(error / sigma).max() < 4

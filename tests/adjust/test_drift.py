@@ -31,17 +31,17 @@ def test_heights_that_climb_do_not_tilt_the_survey() -> None:
     assert np.degrees(np.linalg.norm(result.tilt_rad)) < 8.0
     assert result.normalised < 9.0
     assert "position-drift" in result.codes
-    factors = {factor.group: factor.applied for factor in result.estimated.initial.variance_factors}
+    factors = {factor.group: factor.applied for factor in result.posterior.solution.variance_factors}
     assert factors["vertical drift"] > 50.0
     # The mean of the drift is not seen either: no height is known to metres.
-    assert np.sqrt(result.estimated.posterior.of_similarity[6, 6]) > 15.0
+    assert np.sqrt(result.posterior.of_similarity[6, 6]) > 15.0
 
 
 def test_no_drift_is_seen_where_there_is_none() -> None:
     result = solved(Drift(), seed=2)
     assert not {"position-drift", "ground-steep", "sigma-rejected", "other-photographs"} & result.codes
-    assert all(factor.applied == 1.0 for factor in result.estimated.initial.variance_factors)
-    assert np.sqrt(result.estimated.posterior.of_similarity[6, 6]) < 4.0
+    assert all(factor.applied == 1.0 for factor in result.posterior.solution.variance_factors)
+    assert np.sqrt(result.posterior.of_similarity[6, 6]) < 4.0
 
 
 @pytest.mark.parametrize("receiver", ["RTK fixed", "PPK of a service"])

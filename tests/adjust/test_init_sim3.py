@@ -15,11 +15,12 @@ from pipelines.adjust.options import GeolocateOptions, InitSim3Options
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InputError
 from pipelines.core.products import load_json
 from pipelines.core.runner import run_stage
-from pipelines.core.stages import BY_NAME, SIM3
+from pipelines.core.stages import ADJUSTMENT, BY_NAME, SIM3
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
+from pipelines.survey.adjustment import GeolocatedPoints, SimilarityEstimate
+from pipelines.survey.solution import Solution
 from pipelines.survey.survey import Survey
 from tests.refusals import numbers, refused, said
 from tests.scenes import (
@@ -46,14 +47,14 @@ def material(
 
 def estimated(
     survey: Survey, model: SparseModel, points: GeolocatedPoints, options: InitSim3Options
-) -> tuple[InitialSimilarity, tuple[str, ...]]:
-    """Return the similarity and the warnings."""
-    result = estimate_similarity(survey, model, points, options)
-    return result.initial, result.warnings
+) -> tuple[Solution, tuple[str, ...]]:
+    """Return the solution and the warnings."""
+    posterior, warnings = estimate_similarity(survey, model, points, options)
+    return posterior.solution, warnings
 
 
-def squared_error(found: InitialSimilarity) -> float:
-    record = found.geo_from_local
+def squared_error(found: Solution) -> float:
+    record = found.initial.geo_from_local
     away = GEO_FROM_LOCAL @ Similarity.from_record(record).inverse()
     pivot = np.array(record.pivot)
     error = np.array([np.log(away.scale), *log_so3(away.rotation), *(away.apply(pivot) - pivot)])
@@ -66,15 +67,18 @@ def test_stage_recovers_the_truth_with_rtk(tmp_path: Path) -> None:
     workspace = write_workspace(tmp_path, survey, sparse_model(scene, noise, rng))
     run_stage(workspace, BY_NAME["geolocate"], {})
     outcome = run_stage(workspace, BY_NAME["init-sim3"], {})
-    found = load_json(InitialSimilarity, workspace.path(SIM3))
-    assert found.geo_from_local.scale == pytest.approx(GEO_FROM_LOCAL.scale, rel=1e-3)
-    away = Similarity.from_record(found.geo_from_local).apply(GEO_FROM_LOCAL.inverse().apply(np.eye(3) * 50))
+    found = load_json(Solution, workspace.path(ADJUSTMENT))
+    assert found.initial.geo_from_local.scale == pytest.approx(GEO_FROM_LOCAL.scale, rel=1e-3)
+    away = Similarity.from_record(found.initial.geo_from_local).apply(
+        GEO_FROM_LOCAL.inverse().apply(np.eye(3) * 50)
+    )
     assert squared_error(found) < 24.3  # χ²₇ at 0.999
     # 2–3 cm over √24, and the lens, which moves the scene along the views: 2 cm in σ at 50 m.
     np.testing.assert_allclose(away, np.eye(3) * 50, atol=0.06)
-    assert found.correspondences == {"gnss": 24, "gcp": 0, "points": 120}
-    assert found.residuals["gnss"].rmse_h_m == pytest.approx(0.028, rel=0.6)  # the cameras follow the fixes
-    assert found.layout == "volume"
+    assert found.initial.correspondences == {"gnss": 24, "gcp": 0, "points": 120}
+    assert found.initial.residuals["gnss"].rmse_h_m == pytest.approx(0.028, rel=0.6)  # the cameras follow the fixes
+    assert found.initial.layout == "volume"
+    assert load_json(SimilarityEstimate, workspace.path(SIM3)) == found.initial  # alone, for other programs
     assert outcome.manifest.warnings == ()
 
 
@@ -85,8 +89,8 @@ def test_model_without_residuals_has_finite_sigma(pixel_px: float, control: bool
     survey, model, points = material(Noise(pixel_px=pixel_px), Measured(gcps=control), seed=2)
     found, _ = estimated(survey, model, points, CONFIG)
     # 24 fixes of 2 cm over 50 m.
-    assert found.geo_from_local.scale == pytest.approx(GEO_FROM_LOCAL.scale, rel=1e-3)
-    sigma = np.sqrt(np.diag(np.array(found.geo_from_local.covariance)))
+    assert found.initial.geo_from_local.scale == pytest.approx(GEO_FROM_LOCAL.scale, rel=1e-3)
+    sigma = np.sqrt(np.diag(np.array(found.initial.geo_from_local.covariance)))
     assert np.isfinite(sigma).all() and (sigma > 0).all()
     assert squared_error(found) < 24.3  # χ²₇ at 0.999
 
@@ -96,7 +100,7 @@ def test_outlying_fixes_are_listed() -> None:
     survey, model, points = material(noise, Measured())
     found, warnings = estimated(survey, model, points, CONFIG)
     assert found.gnss_outliers == tuple(f"image_{index:03d}.jpg" for index in noise.outliers)
-    assert found.inliers["gnss"] == 20
+    assert found.initial.inliers["gnss"] == 20
     assert squared_error(found) < 24.3  # χ²₇ at 0.999
     sentence = said(warnings, "fix-outliers")
     assert numbers(sentence)[:2] == [4, 24]
@@ -106,8 +110,8 @@ def test_outlying_fixes_are_listed() -> None:
 def test_control_points_alone_carry_the_survey() -> None:
     survey, model, points = material(Noise(), Measured(fixes=False, attitudes=False, gcps=True))
     found, _ = estimated(survey, model, points, CONFIG)
-    assert found.inliers == {"gnss": 0, "gcp": 6, "points": 0}
-    assert found.residuals["gnss"].count == 0
+    assert found.initial.inliers == {"gnss": 0, "gcp": 6, "points": 0}
+    assert found.initial.residuals["gnss"].count == 0
     assert squared_error(found) < 24.3
 
 
@@ -124,13 +128,13 @@ def test_fixes_that_disagree_with_control_points_are_told_with_numbers() -> None
 def test_paper_method_is_coarse_but_near() -> None:
     survey, model, points = material(Noise(), Measured())
     found, _ = estimated(survey, model, points, InitSim3Options(method="paper"))
-    assert found.method == "paper"
-    away = Similarity.from_record(found.geo_from_local).apply(model.point_in_local)
+    assert found.initial.method == "paper"
+    away = Similarity.from_record(found.initial.geo_from_local).apply(model.point_in_local)
     error = np.linalg.norm(away - GEO_FROM_LOCAL.apply(model.point_in_local), axis=1)
     # 0.5° attitudes over 100 m, averaged over 24 cameras: 0.2 m.
     assert error.mean() < 0.6
     robust, _ = estimated(survey, model, points, CONFIG)
-    assert found.residuals["gnss"].rmse_3d_m > robust.residuals["gnss"].rmse_3d_m
+    assert found.initial.residuals["gnss"].rmse_3d_m > robust.initial.residuals["gnss"].rmse_3d_m
 
 
 def test_paper_method_without_points_says_what_to_use() -> None:
@@ -145,14 +149,14 @@ def test_max_residual_fails_with_the_figures() -> None:
         estimate_similarity(survey, model, points, InitSim3Options(max_residual=0.1))
     count, rms_m, *_, limit_m = numbers(str(error.value))
     assert (count, limit_m) == (24, 0.1) and 0.1 < rms_m < 10.0
-    assert estimated(survey, model, points, InitSim3Options(max_residual=10.0))[0].inliers["gnss"] == 24
+    assert estimated(survey, model, points, InitSim3Options(max_residual=10.0))[0].initial.inliers["gnss"] == 24
 
 
 def test_line_needs_attitude() -> None:
     survey, model, points = material(Noise(), Measured(), layout="line")
     found, _ = estimated(survey, model, points, CONFIG)
-    assert found.layout == "line"
-    assert found.attitude_used
+    assert found.initial.layout == "line"
+    assert found.initial.attitude_used
     assert squared_error(found) < 24.3
     bare = survey.model_copy(
         update={"images": tuple(image.model_copy(update={"attitude": None}) for image in survey.images)}
@@ -178,7 +182,7 @@ def test_unusable_control_points_are_named() -> None:
     broken = second.model_copy(update={"marks": shifted})
     spoilt = survey.model_copy(update={"control_points": (lonely, broken, *rest)})
     found, warnings = estimated(spoilt, model, points, CONFIG)
-    assert found.correspondences["gcp"] == 4
+    assert found.initial.correspondences["gcp"] == 4
     lonely_told, broken_told = (one.sentence for one in warnings if one.code == "control-point-unused")
     assert "gcp0" in lonely_told and "px" not in lonely_told
     assert "gcp1" in broken_told and "px" in broken_told
@@ -237,8 +241,8 @@ def test_control_points_can_be_left_out() -> None:
     survey, model, points = material(CONSUMER, Measured(gcps=True))
     with_control, _ = estimated(survey, model, points, CONFIG)
     without, _ = estimated(survey, model, points, InitSim3Options(control_points=False))
-    assert with_control.correspondences["gcp"] == 6
-    assert without.correspondences["gcp"] == without.residuals["gcp"].count == 0
+    assert with_control.initial.correspondences["gcp"] == 6
+    assert without.initial.correspondences["gcp"] == without.initial.residuals["gcp"].count == 0
     alone, _ = estimated(survey.model_copy(update={"control_points": ()}), model, points, CONFIG)
     assert without == alone
 
@@ -255,9 +259,10 @@ def test_an_assumed_sigma_is_said_once_with_the_option_that_states_it() -> None:
     assumed = survey.model_copy(update={"control_points": wide, "default_sigmas": ("control points", "marks")})
     found, _ = estimated(assumed, model, points, CONFIG)
     factors = {factor.group: factor for factor in found.variance_factors}
-    sentence = said(found.cautions, "default-sigma")
-    of_control, of_marks = sentence.split("--sigma-gcp-v")
+    (default,) = (one for one in found.cautions if one.code == "default-sigma")
+    of_control, of_marks = default.remedy.split("--sigma-gcp-v")
     assert "--sigma-gcp-h" in of_control and "--sigma-mark" in of_marks
+    of_marks = default.sentence.partition("The marks")[2]
     assert factors["marks"].applied == pytest.approx(1 / 49, rel=0.5)
     assert numbers(of_marks) == pytest.approx([np.sqrt(factors["marks"].applied), wide_px], rel=0.05)
     off = [point.position_in_geo for point in survey.control_points]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.adjust.posterior import intersection_jacobian
+from pipelines.geometry.intersection import intersection_jacobian
 from tests.bundle_scenes import exact_network, jacobian
 
 

@@ -62,7 +62,7 @@ def remarks_of(kind: str, *, timed: bool) -> list[tuple[str, str]]:
     ]
     survey = survey.model_copy(update={"images": tuple(images)})
     found = rolling_shutter_of(survey, model, 1.0, bundle_of(model).row_motion)
-    return [(remark.code, remark.sentence) for remark in found]
+    return [(remark.code, remark.text) for remark in found]
 
 
 def test_the_readout_time_of_a_flight_to_and_fro_is_found() -> None:

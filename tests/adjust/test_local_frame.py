@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from pipelines.adjust.geolocate import geolocate
-from pipelines.adjust.init_sim3 import Estimated, estimate_similarity
+from pipelines.adjust.init_sim3 import estimate_similarity
 from pipelines.adjust.local_frame import Up, local_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
+from pipelines.adjust.posterior import Posterior
 from pipelines.core.errors import DegenerateGeometryError
+from pipelines.core.products import Remark
 from pipelines.geometry.similarity import Similarity
-from pipelines.survey.marks import mark_rays
+from pipelines.survey.marks import mark_rays, triangulated_points
 from pipelines.survey.survey import KnownDistance, PointMarks, Survey, SurveyedPoint
-from pipelines.survey.trained_survey import SolvedSurvey, triangulated_points
 from tests.drawn_surveys import Receiver, drawn, flight, marked, surveyed
 from tests.refusals import codes, refused
 from tests.scenes import Noise, TrueScene, looking_at, sparse_model
@@ -60,19 +61,18 @@ def seen_from(scene: TrueScene, survey: Survey) -> Survey:
     return survey.model_copy(update={"distances": (known(ends, 10.0),)})
 
 
-def solved(survey: Survey) -> Estimated:
+def solved(survey: Survey) -> tuple[Posterior, tuple[Remark, ...]]:
     points = geolocate(survey, FLIGHT.model, GeolocateOptions())
     assert not points.warnings
     return estimate_similarity(survey, FLIGHT.model, points.points, InitSim3Options())
 
 
-def lengths(estimated: Estimated, survey: Survey, held: tuple[SurveyedPoint, ...]) -> tuple[np.ndarray, np.ndarray]:
+def lengths(posterior: Posterior, survey: Survey, held: tuple[SurveyedPoint, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of all distances between points that are left, and their predicted σ."""
-    posterior = estimated.posterior
     pairs = list(combinations(held, 2))
     ends = [end for pair in pairs for end in pair]
     rays = mark_rays(ends, posterior.sparse)
-    found = triangulated_points(SolvedSurvey(survey, FLIGHT.model, posterior.solution), rays)
+    found = triangulated_points(posterior.solution, rays)
     true = np.array([end.position_in_geo for end in ends])
     error = np.subtract(*(np.linalg.norm(place[::2] - place[1::2], axis=1) for place in (found, true)))
     return error, np.sqrt(posterior.of_distances(found, rays))
@@ -82,18 +82,18 @@ def test_three_distances_set_the_scale_with_the_sigma_that_is_predicted() -> Non
     normalised, of_scale = [], []
     for seed in range(6):
         survey, held = local_survey(np.random.default_rng(seed))
-        estimated = solved(survey)
-        error, sigma = lengths(estimated, survey, held)
+        posterior, _ = solved(survey)
+        error, sigma = lengths(posterior, survey, held)
         normalised.append((error / sigma) ** 2)
         assert np.abs(error / sigma).max() < 4
         # The true scale is that of `local`: its metre is known from the scene.
-        ratio = estimated.initial.geo_from_local.scale / FLIGHT.scene.geo_from_local.scale
-        of_scale.append(np.log(ratio) / estimated.posterior.of_similarity[0, 0] ** 0.5)
-        covariance = estimated.posterior.of_similarity
+        ratio = posterior.solution.similarity_from_local().scale / FLIGHT.scene.geo_from_local.scale
+        of_scale.append(np.log(ratio) / posterior.of_similarity[0, 0] ** 0.5)
+        covariance = posterior.of_similarity
         assert np.sqrt(covariance[0, 0]) < 1e-3
         # What nothing measures is fixed: rotation and shift of the mean have no σ of their own.
         assert np.sqrt(np.diag(covariance)[1:4]).max() < 1e-5
-        assert "local-frame-level" in codes(estimated.initial.cautions)
+        assert "local-frame-level" in codes(posterior.solution.cautions)
     assert np.abs(of_scale).max() < 3
     # Six draws of pairs that share their points.
     assert 0.4 < np.mean(normalised) < 1.9
@@ -101,8 +101,8 @@ def test_three_distances_set_the_scale_with_the_sigma_that_is_predicted() -> Non
 
 def test_the_frame_is_level_and_lies_about_the_cameras() -> None:
     survey, _ = local_survey(np.random.default_rng(0))
-    estimated = solved(survey)
-    similarity = Similarity.from_record(estimated.initial.geo_from_local)
+    posterior, _ = solved(survey)
+    similarity = Similarity.from_record(posterior.solution.similarity_from_local())
     centers = similarity.apply(FLIGHT.model.cam_center_in_local)
     assert np.abs(centers.mean(axis=0)).max() < 0.01
     up_in_local = FLIGHT.scene.geo_from_local.rotation[2]
@@ -126,8 +126,8 @@ def test_the_vertical_of_an_orbit(up: Up) -> None:
 
 def test_a_wrong_distance_of_several_is_named() -> None:
     survey, _ = local_survey(np.random.default_rng(1), blunder_m=0.5)
-    estimated = solved(survey)
-    assert codes(estimated.warnings) == ["distances-disagree"] or estimated.initial.distance_outliers
+    posterior, warnings = solved(survey)
+    assert codes(warnings) == ["distances-disagree"] or posterior.solution.distance_outliers
 
 
 def test_without_a_distance_that_can_be_measured_there_is_no_scale() -> None:

@@ -2,6 +2,7 @@
 
 Each run draws image observations, fixes, control points and marks with the σ that they state. The bundle is
 adjusted with its lens, the tool then finds similarity and cameras, and points that no one surveyed are intersected
+from pipelines.survey.adjustment import MeasurementVerdict
 from their marks. The bundle is small and its lens is weak (σ of the focal length 0.3 %), so that every part of the
 prediction counts: the similarity, the cameras, the lens, the marks. In a second bundle all cameras are level,
 which leaves the principal point, and with it the heights, to the fixes.
@@ -19,18 +20,19 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 
 from pipelines.adjust.measurements import problem_of, start_of
-from pipelines.adjust.posterior import intersection_jacobian
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.system import linearised, minimise
 from pipelines.evaluate.check_points import chi2_caution
+from pipelines.geometry.intersection import intersection_jacobian
 from pipelines.geometry.network import Network
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
+from pipelines.survey.adjustment import MeasurementVerdict
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Fix, Mark, Survey, SurveyedPoint
 from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, noisy, pixels, readjusted, size
 from tests.drawn_surveys import missed, rows_of
-from tests.scenes import Measured, Noise, initial_product, material
+from tests.scenes import Measured, Noise, material
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 IMAGES, MARK_PX, SURVEY_M = 8, 0.3, 0.02
@@ -41,7 +43,6 @@ PLACES = np.random.default_rng(99)
 CONTROL = PLACES.uniform([-8, -8, -4], [8, 8, 6], (5, 3))
 CHECK = PLACES.uniform([-9, -9, -6], [9, 9, 9], (12, 3))
 NAMES = tuple(f"image_{index:03d}.jpg" for index in range(IMAGES))
-INITIAL = initial_product(Similarity().to_record("local", "geo"))
 
 
 @pytest.fixture(autouse=True)
@@ -151,17 +152,21 @@ def one_run(seed: int, setting: Setting, solve: np.ndarray) -> Run:
     scene = scene_of(network)
     problem = problem_of(scene, survey)
     state = minimise(problem, start_of(scene, problem)).state
-    return Run(*missed(adjusted(scene, problem, state, INITIAL), survey))
+    return Run(*missed(adjusted(scene, problem, state, MeasurementVerdict()), survey))
+
+
+def runs_of(count: int, profile: str) -> list[Run]:
+    return [drawn(seed, profile) for seed in range(count)]
 
 
 @cache
-def runs_of(count: int, profile: str) -> tuple[Run, ...]:
-    return tuple(draw(count, PROFILES[profile]))
+def drawn(seed: int, profile: str) -> Run:
+    return one_run(seed, PROFILES[profile], solver(profile))
 
 
-def draw(count: int, setting: Setting) -> list[Run]:
-    solve = adjuster(setting.truth)
-    return [one_run(seed, setting, solve) for seed in range(count)]
+@cache
+def solver(profile: str) -> np.ndarray:
+    return adjuster(PROFILES[profile].truth)
 
 
 def squares(found: Iterable[Run]) -> tuple[np.ndarray, np.ndarray]:
@@ -263,14 +268,13 @@ def test_heights_come_near_the_bound_because_the_lens_follows() -> None:
 
 def test_slow_descents_end() -> None:
     # Control points that disagree a little: Cauchy's weights make 150 plain steps of this draw too short.
-    setting = PROFILES["consumer and control"]
-    assert np.isfinite(one_run(1209, setting, adjuster(setting.truth)).error).all()
+    assert np.isfinite(drawn(1209, "consumer and control").error).all()
 
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_predicted_accuracy_is_true_for_each_axis(profile: str) -> None:
     setting = PROFILES[profile]
-    squared, variance = squares(draw(200, setting))
+    squared, variance = squares(runs_of(200, profile))
     # Robust weights follow the noise of a few measurements: the mean of 800 runs is 1.03 to 1.11. σ of 200: 0.06.
     np.testing.assert_allclose((squared / variance).mean(axis=(0, 1)), 1.0, atol=0.25)
     least = bound(setting).mean(axis=0)

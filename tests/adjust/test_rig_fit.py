@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
 
 from pipelines.adjust.alignment import Correspondences
-from pipelines.adjust.rig_fit import (
-    LIMIT_ARM_M,
-    LIMIT_OFFSET_S,
-    FitOptions,
-    RigData,
-    fit_rig,
-)
+from pipelines.adjust.rig_fit import LIMIT_OFFSET_S, FitOptions, RigData, fit_rig
+from pipelines.adjust.state import SIGMA_ARM_M, SIGMA_BORESIGHT_RAD, SystematicError, SystematicErrors, is_observed
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import exp_so3, log_so3
@@ -93,7 +89,7 @@ def test_lever_arm_with_control_points() -> None:
     data = _data(_flight("orbit"), control=6, arm_m=np.zeros(3))
     found = fit_rig(data, 0.0, np.eye(3), FitOptions(arm=True))
     sigma = found.sigma[11:14]
-    assert (sigma < LIMIT_ARM_M).all()
+    assert is_observed("lever-arm", sigma, SIGMA_ARM_M).all()
     assert np.all(np.abs(found.state.arm - ARM_M) < np.maximum(4 * sigma, 0.01))
     assert found.state.offset_s == pytest.approx(OFFSET_S, abs=0.02)
 
@@ -142,7 +138,35 @@ def test_sigma_counts_a_lens_that_sfm_has_not_quite_found() -> None:
 def test_downward_lever_arm_of_a_level_flight_is_not_observable() -> None:
     data = _data(_flight("grid"), arm_m=np.zeros(3))
     found = fit_rig(data, 0.0, np.eye(3), FitOptions(arm=True))
-    assert found.sigma[13] > LIMIT_ARM_M  # the height of the whole takes it up
+    # The height of the whole takes it up.
+    assert not is_observed("lever-arm", found.sigma[11:14], SIGMA_ARM_M)[2]
+
+
+@pytest.mark.parametrize(
+    ("name", "prior", "limit", "unit"),
+    [("lever-arm", SIGMA_ARM_M, 0.1, 1.0), ("boresight", SIGMA_BORESIGHT_RAD, np.radians(0.5), np.degrees(1.0))],
+)
+def test_calibration_and_adjustment_observe_by_one_rule(
+    name: Literal["lever-arm", "boresight"], prior: float, limit: float, unit: float
+) -> None:
+    """At the limit, the prior moves an estimate by 1 % of the way to its start."""
+    assert limit**2 / (limit**2 + prior**2) < 0.01
+    sigma = np.array([0.99, 1.01, 0.5]) * limit
+    seen = is_observed(name, sigma, prior)
+    assert seen.tolist() == [True, False, True]
+    errors = SystematicErrors((SystematicError(name, (prior, prior, prior)),))
+    (estimate,) = errors.estimates(np.zeros(3), np.diag(sigma**2))
+    assert estimate.observed == tuple(seen.tolist())
+    assert np.array(estimate.prior) == pytest.approx(unit * prior)
+
+
+def test_long_lever_arm_is_not_drawn_to_its_start() -> None:
+    """An arm of 1.5 m, half as long again as the σ of its prior."""
+    offset_m = np.array([1.2, -0.8, 0.4])
+    data = _data(_flight("orbit"), control=6, arm_m=ARM_M - offset_m)
+    found = fit_rig(data, 0.0, np.eye(3), FitOptions(arm=True))
+    sigma = found.sigma[11:14]
+    assert np.all(np.abs(found.state.arm - offset_m) < np.maximum(4 * sigma, 0.015))
 
 
 def _circle(speed_wobble: float) -> RigData:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipelines.adjust import solution
 from pipelines.adjust.geolocate import geolocate
 from pipelines.adjust.init_sim3 import estimate_similarity
 from pipelines.adjust.options import GeolocateOptions, InitSim3Options
@@ -21,6 +22,12 @@ CONSUMER = Receiver((2.5, 2.5, 5.0), (2.0, 2.0, 4.0))
 PROFILES = {"rtk, control": (RTK, 0.01), "rtk": (RTK, None), "consumer": (CONSUMER, None)}
 
 
+@pytest.fixture(autouse=True)
+def _without_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The σ over the scene are not asked for here, and take time."""
+    monkeypatch.setattr(solution, "accuracy_grid", lambda *_: None)
+
+
 def normalised(of: Flight, receiver: Receiver, control_m: float | None, draws: int) -> tuple[np.ndarray, float]:
     """eᵀ C⁻¹ e over the degrees of freedom of each draw, and the horizontal RMSE of all."""
     squares, errors = [], []
@@ -28,7 +35,8 @@ def normalised(of: Flight, receiver: Receiver, control_m: float | None, draws: i
         rng = np.random.default_rng(seed)
         survey = surveyed(of, drawn(of, rng), receiver, control_m, rng)
         points = geolocate(survey, of.model, GeolocateOptions()).points
-        error, joint = missed(estimate_similarity(survey, of.model, points, InitSim3Options()).posterior, survey)
+        posterior, _ = estimate_similarity(survey, of.model, points, InitSim3Options())
+        error, joint = missed(posterior, survey)
         squares.append(error.ravel() @ np.linalg.solve(joint, error.ravel()) / error.size)
         errors.append(error)
     return np.array(squares), float(np.sqrt((np.array(errors)[:, :, :2] ** 2).sum(axis=2).mean()))

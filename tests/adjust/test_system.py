@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import pytest
 
-from pipelines.adjust.posterior import camera_covariances, intersection_jacobian
+from pipelines.adjust.posterior import camera_covariances
 from pipelines.adjust.state import State, SystematicError, SystematicErrors
 from pipelines.adjust.system import Minimum, NormalMatrix, Problem, linearised, minimise
 from pipelines.adjust.terms import (
@@ -26,6 +26,7 @@ from pipelines.adjust.terms import (
 )
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.geometry.cameras import CameraPoses, Lenses, bearings
+from pipelines.geometry.intersection import intersection_jacobian
 from pipelines.geometry.network import Network
 from pipelines.geometry.rotations import exp_so3, log_so3
 from pipelines.geometry.similarity import Similarity, perturbation
@@ -71,24 +72,24 @@ def measured(
     camera, half = np.arange(IMAGES), np.arange(IMAGES) * 2 // IMAGES
     position = geo_from_model.apply(poses.cam_center_in_model)
     names = tuple(map(str, camera))
-    root = np.linalg.inv(np.linalg.cholesky(np.diag([0.02, 0.02, 0.03]) ** 2 + 1e-5))
+    cov = np.diag([0.02, 0.02, 0.03]) ** 2 + 1e-5
     fixes = Fixes(
         names,
         camera,
-        position + part * rng.normal(size=(IMAGES, 3)) @ np.linalg.inv(root).T,
-        np.tile(root, (IMAGES, 1, 1)),
+        position + part * rng.normal(size=(IMAGES, 3)) @ np.linalg.cholesky(cov).T,
+        np.tile(cov, (IMAGES, 1, 1)),
         half,
     )
     turned = geo_from_model.rotation @ np.swapaxes(poses.cam_from_model, 1, 2)
     recorded = turned @ exp_so3(part * 0.01 * rng.normal(size=(IMAGES, 3)))
-    attitudes = Attitudes(names, camera, recorded, np.tile(np.eye(3) / 0.01, (IMAGES, 1, 1)))
+    attitudes = Attitudes(names, camera, recorded, np.tile(0.01**2 * np.eye(3), (IMAGES, 1, 1)))
     surface = network.point_in_world[:10]
     normal = rng.normal([0, 0, 2], 1, (10, 3))
     planes = Planes(
         surface,
         geo_from_model.apply(surface) + part * 0.03 * rng.normal(size=(10, 3)),
         normal / np.linalg.norm(normal, axis=1, keepdims=True),
-        np.full((10, 1, 1), 1 / 0.03),
+        np.full((10, 1, 1), 0.03**2),
     )
     control = control_points(network, geo_from_model, rng, part)
     pairs = len(CONTROL) // 2
@@ -100,7 +101,7 @@ def measured(
         *(getattr(control, of_mark)[ends] for of_mark in ("point", "camera", "bearing_in_cam", "sigma_rad")),
         control.bearing_by_lens[ends],
         true_m + part * 0.005 * rng.normal(size=pairs),
-        np.full((pairs, 1, 1), 1 / 0.01),
+        np.full((pairs, 1, 1), 0.01**2),
     )
     terms = (fixes, control, distances, attitudes, planes)
     return {term.kind: term for term in terms}
@@ -121,7 +122,7 @@ def control_points(
         np.full(len(xy_px), 0.3 / LENS.params[0]) * rng.uniform(0.5, 1.5, len(xy_px)),
         by_lens,
         geo_from_model.apply(CONTROL) + part * 0.02 * rng.normal(size=CONTROL.shape),
-        np.tile(np.diag([50.0, 50.0, 25.0]), (len(CONTROL), 1, 1)),
+        np.tile(np.diag([0.02, 0.02, 0.04]) ** 2, (len(CONTROL), 1, 1)),
     )
 
 
@@ -181,7 +182,7 @@ def at_a_random_state(kind: str, seed: int) -> tuple[Problem, State, Term]:
     of_kind = measured(EXACT, GEO_FROM_MODEL, rng, 1.0) if kind != CommonErrors.kind else {}
     if kind == Level.kind:  # half a radian off
         up = exp_so3([0.3, -0.4, 0.1]) @ GEO_FROM_MODEL.rotation[2]
-        of_kind = {kind: Level(up[None], np.linalg.svd(up[None])[2][None, 1:], np.eye(2)[None] / 0.05)}
+        of_kind = {kind: Level(up[None], np.linalg.svd(up[None])[2][None, 1:], 0.05**2 * np.eye(2)[None])}
     problem = problem_of(EXACT, tuple(term for name, term in of_kind.items() if name == kind), ERRORS)
     term = problem.term(kind)
     assert term is not None
@@ -513,14 +514,14 @@ def test_layouts_that_leave_the_similarity_open_are_refused() -> None:
         sigma_rad=control.sigma_rad[two],
         bearing_by_lens=control.bearing_by_lens[two],
         position_in_geo=control.position_in_geo[:2],
-        root_information=control.root_information[:2],
+        cov=control.cov[:2],
     )
     few = replace(
         fixes,
         name=fixes.name[:2],
         camera=fixes.camera[:2],
         position_in_geo=fixes.position_in_geo[:2],
-        root_information=fixes.root_information[:2],
+        cov=fixes.cov[:2],
         session=fixes.session[:2],
     )
     for terms in ((), (pair,), (few,)):

@@ -119,6 +119,20 @@ LIBRARIES = {
         "87a6890202db9ff63e0fd24c6c51a427eb5159d6a2469112ac3826eb2c20d1d3",
         ".",
     ),
+    "PlayCanvasParsers": Library(
+        "playcanvas",
+        "2.23.3",
+        "8630dda39c85b55aff5a60e1e7da51ad3d4b0be45fa6ae155c1f17b7700c07c1"
+        "9f5978fd27338cab7c7edc54e6abfd8bda0377eeaf55d4b31968bb98b21ccc5d",
+        "scripts/esm/parsers",
+    ),
+    "Fzstd": Library(
+        "fzstd",
+        "0.1.1",
+        "764b9548e28ac21dde6ace55909cb5016d6f1697adf1303f7c699503992b4e19"
+        "7c61c39513ff19228100d7e535bc49f9724c7184b8ab49d63cdfb6b399b68d1c",
+        ".",
+    ),
     "Three": Library(
         "three",
         "0.187.0",
@@ -138,6 +152,13 @@ LIBRARIES = {
         "0.8.2",
         "70f254e3b39a02809b834a41bf3b20a533e19a1a88e5e26387f248bbcb4f8f9a"
         "be4fb88bbd6fc901852a984eca381e11d59c8487305a210a50a5aadd045e73f0",
+        ".",
+    ),
+    "SplatTransform": Library(
+        "@playcanvas/splat-transform",
+        "3.7.0",
+        "aba4f278a6708ce4b15893cefe9cf4525bcd12ecc31e8bdd8a8ef3b8f3a15994"
+        "ef5da9fbff5963be10cad6e930f7425c9b010d84c30e27e796500e04e2e6f100",
         ".",
     ),
     "Esbuild": Library(

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from pipelines.deliver.options import PageOptions, SplatOptions
-from pipelines.deliver.placement import place
+from pipelines.deliver.placement import solved_placement
 from pipelines.deliver.splat import PlacedSplat, placed_splat
 from pipelines.deliver.tiles_page import ScenePage, scene_page
 from pipelines.geodesy.enu import (
@@ -140,7 +140,9 @@ def placed(gaussians: Gaussians) -> PlacedSplat:
     """Return Gaussians in `scene` as a deliverable gets them: from a model of another scale and turn."""
     in_model = transformed(gaussians, GEO_FROM_MODEL.inverse() @ GEO_FROM_SCENE)
     return placed_splat(
-        in_model, place(trained_model(GEO_FROM_MODEL), survey(), in_model.means.numpy(), None), SplatOptions()
+        in_model,
+        solved_placement(trained_model(GEO_FROM_MODEL), survey(), in_model.means.numpy(), None),
+        SplatOptions(),
     )
 
 

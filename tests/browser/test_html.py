@@ -22,12 +22,12 @@ from pipelines.deliver.options import ExportHtmlOptions
 from pipelines.geometry.cameras import Pinhole, pose_matrix
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
+from pipelines.survey.solution import read_solution
 from pipelines.survey.survey import Survey, SurveyedPoint
-from pipelines.survey.trained_survey import load_trained
 from tests.deliver.test_html import HOSTILE, with_measurements
 from tests.scripts import REPOSITORY, load_script
 from tests.splat_scenes import make_rendered
-from tests.view_scenes import smooth, viewed_workspace
+from tests.view_scenes import renderer_of, smooth, viewed_workspace
 
 pytestmark = pytest.mark.browser
 SIZE = (480, 360)
@@ -93,7 +93,7 @@ def opened(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def test_view_of_a_photograph_is_our_render_of_it(opened: Opened) -> None:
-    trained = load_trained(opened.workspace)
+    trained = renderer_of(opened.workspace)
     lens = trained.sparse.camera_of(0)
     focal = lens.mean_focal_px * SIZE[1] / lens.height
     assert lens.width / lens.height == pytest.approx(SIZE[0] / SIZE[1])
@@ -128,7 +128,7 @@ def test_texts_state_place_accuracy_and_measurements(opened: Opened) -> None:
 
 def test_a_photograph_is_chosen_by_name_and_left_by_turning(opened: Opened) -> None:
     page = opened.page
-    name = load_trained(opened.workspace).sparse.image_name[3]
+    name = read_solution(opened.workspace).cameras[3].name
     page.locator("#photograph").select_option(label=name)
     stood, truth = page.evaluate("async () => [(await georef).camera.position.toArray(), page.cameras[3].at]")
     assert stood == pytest.approx(truth)

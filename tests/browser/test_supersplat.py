@@ -1,4 +1,4 @@
-"""The PLY in SuperSplat's viewer, in headless Chromium: which way up it stands along each of the file's axes."""
+"""PLY and streamed SOG in SuperSplat's viewer, in headless Chromium: which way up they stand."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import pytest
 import torch
 from playwright.sync_api import Browser
 
-from pipelines.deliver.options import ExportPlyOptions
+from pipelines.deliver.options import ExportPlyOptions, ExportSogOptions
 from pipelines.deliver.ply import write_ply
+from pipelines.deliver.sog import write_streamed
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.sh import sh_from_rgb
 from tests.browser import hill
@@ -49,14 +50,11 @@ def pillar() -> Gaussians:
     return Gaussians(means, quaternions, log_scales, torch.full((len(points),), 4.0), harmonics)
 
 
-@pytest.mark.parametrize(("up", "angle_deg"), [("-y", 90.0), ("y", -90.0), ("z", None)])
-def test_minus_y_alone_is_upright(
-    browser: Browser, tmp_path: Path, up: Literal["-y", "y", "z"], angle_deg: float | None
-) -> None:
-    write_ply(hill.placed(pillar()), tmp_path / "splat.ply", ExportPlyOptions(up=up))
-    (tmp_path / "index.html").write_text(PAGE)
+def towards_red_deg(browser: Browser, folder: Path, content: str) -> float:
+    """Return the angle on the screen, from the right to the top, of the way from the blue to the red half."""
+    (folder / "index.html").write_text(PAGE.replace("splat.ply", content))
     viewer = new_viewer(browser)
-    with served(tmp_path) as root:
+    with served(folder) as root:
         viewer.show(root)
         viewer.page.wait_for_function("window.viewer?.state.loaded")
         picture = cv2.imdecode(np.frombuffer(viewer.page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
@@ -67,9 +65,22 @@ def test_minus_y_alone_is_upright(
     red, blue = (np.argwhere(sign * blueness > 100) for sign in (-1, 1))
     assert min(len(red), len(blue)) > 1000  # pixels: both halves are seen
     down, right = red.mean(axis=0) - blue.mean(axis=0)
-    towards_red_deg = np.degrees(np.arctan2(-down, right))
+    return float(np.degrees(np.arctan2(-down, right)))
+
+
+@pytest.mark.parametrize(("up", "angle_deg"), [("-y", 90.0), ("y", -90.0), ("z", None)])
+def test_minus_y_alone_is_upright(
+    browser: Browser, tmp_path: Path, up: Literal["-y", "y", "z"], angle_deg: float | None
+) -> None:
+    write_ply(hill.placed(pillar()), tmp_path / "splat.ply", ExportPlyOptions(up=up))
+    found_deg = towards_red_deg(browser, tmp_path, "splat.ply")
     if angle_deg is None:
-        assert abs(np.sin(np.radians(towards_red_deg))) < 0.71  # nearer to level than to upright
+        assert abs(np.sin(np.radians(found_deg))) < 0.71  # nearer to level than to upright
     else:
         # The scene's middle is rounded to 0.05 m: less than 1° seen from 3.5 m; random places add as much.
-        assert towards_red_deg == pytest.approx(angle_deg, abs=5)
+        assert found_deg == pytest.approx(angle_deg, abs=5)
+
+
+def test_streamed_sog_is_upright(browser: Browser, tmp_path: Path) -> None:
+    write_streamed(tmp_path, hill.placed(pillar()), ExportSogOptions())
+    assert towards_red_deg(browser, tmp_path, "lod-meta.json") == pytest.approx(90, abs=5)

@@ -86,7 +86,7 @@ def test_picture_is_the_render_and_the_mouse_moves_it(hill: Opened) -> None:
 def test_clicks_on_signs_give_what_evaluate_states(hill: Opened, workspace: Workspace) -> None:
     rows = {row.name: row for row in read_report(workspace.path(REPORT)).checkpoints.surface.points}
     hill.begin("point")
-    for point in hill.server.viewer.trained.survey.check_points[:4]:
+    for point in hill.server.viewer.survey.check_points[:4]:
         hill.click(np.array(point.position_in_geo))
         row = rows[point.name]
         wait(lambda: hill.page.locator("#results").get_by_text(point.name).count() == 1)  # noqa: B023
@@ -191,7 +191,7 @@ def test_reload_back_button_and_a_second_page_keep_what_is_shown(
 
 
 def test_marks_are_set_disagree_and_are_written(hill: Opened, workspace: Workspace) -> None:
-    point = hill.server.viewer.trained.survey.check_points[3]
+    point = hill.server.viewer.survey.check_points[3]
     image = hill.come_close(point.name)
     row = hill.page.locator(f'[data-mark="{image}"]')
     before = np.array([float(v) for v in str(row.get_attribute("data-px")).split(",")])
@@ -233,7 +233,7 @@ def test_marks_are_set_disagree_and_are_written(hill: Opened, workspace: Workspa
 
 
 def test_marks_are_proposed(hill: Opened) -> None:
-    point = hill.server.viewer.trained.survey.check_points[2]
+    point = hill.server.viewer.survey.check_points[2]
     hill.come_close(point.name)
     rows = hill.page.locator("[data-mark]")
     places = {str(row.get_attribute("data-mark")): str(row.get_attribute("data-px")) for row in rows.all()}

@@ -101,7 +101,7 @@ def whole_way(view: Opened, workspace: Workspace, shot: Callable[[str], object],
     view.press("Around the middle of the view")
     view.settle()
     shot("8 clipping box")
-    view.come_close(viewer.trained.survey.check_points[0].name)
+    view.come_close(viewer.survey.check_points[0].name)
     assert page.locator("[data-mark]").count() >= 2 and page.locator("#neighbours canvas").count() >= 2
     shot("9 a mark beside its neighbours")
     view.tab("See")
@@ -115,7 +115,7 @@ def whole_way(view: Opened, workspace: Workspace, shot: Callable[[str], object],
 def _ends_on_a_sign(view: Opened, workspace: Workspace) -> None:
     """A double click on the sign of a check point ends a line there, once."""
     rows = {row.name: row for row in read_report(workspace.path(REPORT)).checkpoints.surface.points}
-    named = {point.name: point for point in view.server.viewer.trained.survey.check_points}
+    named = {point.name: point for point in view.server.viewer.survey.check_points}
     point, row = next(
         (point, rows[name]) for name, point in named.items() if name in rows and rows[name].de_m is not None
     )

@@ -60,7 +60,7 @@ class Opened:
     def pixel(self, point_in_geo: np.ndarray) -> tuple[float, float]:
         """Return where a point is on the page."""
         camera = self.camera().camera()
-        place = self.server.viewer.frame.place(np.asarray(point_in_geo, dtype=float))
+        place = self.server.viewer.frame.from_geo(np.asarray(point_in_geo, dtype=float))
         x, y = camera.pinhole().project(camera.rotation @ (place - camera.position))
         return float(x), float(y)
 

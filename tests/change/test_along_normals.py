@@ -16,7 +16,7 @@ from pipelines.core.stages import CLOUD
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.formats.cloud_ply import CloudPoints
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
-from pipelines.formats.geotiff import frame_of
+from pipelines.formats.geotiff import raster_frame
 from pipelines.formats.las import LazWriter, read_surface
 from pipelines.geodesy.crs import parse_crs
 from pipelines.survey.change_report import Change
@@ -24,17 +24,17 @@ from tests.change_pairs import GROUND_M, town_pair
 from tests.refusals import refused
 
 NOISE_M, MOVED_M = 0.03, 0.25
-HALF_M, WALL_M, PER_M2 = 20.0, 8.0, 60.0
+HALF_M, WALL_M, PER_M2 = 20.0, 8.0, 60.0  # points in a square metre
 
 
-def write_cloud(workspace: Workspace, rng: np.random.Generator, wall_m: float) -> None:
+def write_cloud(workspace: Workspace, rng: np.random.Generator, wall_m: float, *, per_m2: float = PER_M2) -> None:
     """Write level ground, and before it a wall that faces south, moved south by `wall_m`."""
     raster = workspace.root / "raster" / "dsm.tif"
-    frame, sidecar = frame_of(raster), load_json(CrsSidecar, sidecar_path(raster))
+    frame, sidecar = raster_frame(raster), load_json(CrsSidecar, sidecar_path(raster))
     middle = np.array([frame.west + frame.columns * frame.step_x / 2, frame.north - frame.rows * frame.step_y / 2])
-    count = int(4 * HALF_M**2 * PER_M2)
+    count = int(4 * HALF_M**2 * per_m2)
     ground = np.column_stack([rng.uniform(-HALF_M, HALF_M, (count, 2)), np.zeros(count)])
-    count = int(2 * HALF_M * WALL_M * PER_M2)
+    count = int(2 * HALF_M * WALL_M * per_m2)
     wall = np.column_stack(
         [rng.uniform(-HALF_M, HALF_M, count), np.full(count, 5.0 - wall_m), rng.uniform(0.5, WALL_M, count)]
     )
@@ -89,7 +89,7 @@ def test_clouds_without_sigma_or_of_another_crs_are_refused(tmp_path: Path) -> N
     before, after = town_pair(tmp_path, changed=False).workspaces
     rng = np.random.default_rng(2)
     for workspace in (before, after):
-        write_cloud(workspace, rng, 0.0)
+        write_cloud(workspace, rng, 0.0, per_m2=2.0)  # refused before any of them is compared
     path = before.root / CLOUD
     (first, *_) = read_surface(path, 100)
     assert len(first) == 100 and np.isfinite(first.cov_m2).all()

@@ -11,9 +11,9 @@ from pipelines.change.detection import (
     Cells,
     Noise,
     Samples,
+    region_volumes,
     significant_change,
     unchanged_ground,
-    volumes,
 )
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import FloatArray
@@ -87,7 +87,7 @@ def test_an_interpolated_part_errs_as_one() -> None:
     cells = level_cells(np.full(shape, -1.0), np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2)))
     cells = replace(cells, step_m2=np.where(hole, sigma_m**2, 0.0), is_measured=~hole)
     _, noise = analysed(correlated_noise(np.random.default_rng(2)))
-    (volume,) = volumes(inside, cells, 1)
+    (volume,) = region_volumes(inside, cells, 1)
     assert volume.sigma_m3(noise, CELL_M**2) == pytest.approx(40 * sigma_m * CELL_M**2)
 
 
@@ -109,7 +109,7 @@ def test_volumes_err_as_their_sigma_says_over_twenty_pairs() -> None:
         cells, noise = analysed(SHIFT_M + truth + correlated_noise(np.random.default_rng(100 + seed)))
         moved = np.full((SIDE, SIDE), np.sqrt(noise.shift_cov_m2[2, 2]))
         centred = replace(cells, difference_m=cells.difference_m - noise.shift_m[2], datum_m=moved)
-        (volume,) = volumes(inside, centred, 1)
+        (volume,) = region_volumes(inside, centred, 1)
         found_m3, true_m3 = (volume.fill - volume.cut) * CELL_M**2, truth.sum() * CELL_M**2
         ratios.append((found_m3 - true_m3) / volume.sigma_m3(noise, CELL_M**2))
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4

@@ -19,8 +19,9 @@ from pipelines.core.stages import CHANGE, CLOUD
 from pipelines.core.staleness import StageState, changed_inputs
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.formats.geotiff import read_cells
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.change_report import Change
-from pipelines.survey.trained_survey import load_trained
+from pipelines.survey.solution import read_sfm, read_solution
 from pipelines.view.overlays import changed_regions
 from pipelines.view.pictures import frame_of
 from tests.change_pairs import CELL_M, TownPair, town_pair
@@ -68,16 +69,16 @@ def test_the_viewer_draws_regions_on_the_surface(tmp_path: Path) -> None:
     (after.root / "change").mkdir()
     run(StageRun(after, after.root / "change"), ChangeOptions(before=before.root, stable_auto=True))
     change = load_json(Change, after.root / "change" / "change.json")
-    trained = load_trained(after)
-    frame = frame_of(trained)
-    drawn = changed_regions(after, trained, frame)
+    solution, survey = read_solution(after), load_survey(after)
+    frame = frame_of(solution, read_sfm(after, solution))
+    drawn = changed_regions(after, survey, frame)
     assert [each["text"].partition(":")[0] for each in drawn] == [region.name for region in change.regions]
     for each, region in zip(drawn, change.regions, strict=True):
         assert each["raised"] == (region.net_m3 > 0)
         plan = np.array(each["at"])[:, :2]
         assert shapely.Polygon(plan).area == pytest.approx(region.area_m2, rel=0.3)  # between the cells that count
     height = np.concatenate([np.array(each["at"])[:, 2] for each in drawn]) + frame.middle_in_geo[2]
-    lowest, highest = pair.after.min() - trained.survey.origin.alt_m, pair.after.max() - trained.survey.origin.alt_m
+    lowest, highest = pair.after.min() - survey.origin.alt_m, pair.after.max() - survey.origin.alt_m
     assert ((height > lowest - 1) & (height < highest + 1)).all()
 
 

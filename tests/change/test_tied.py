@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,52 +11,23 @@ import pytest
 import shapely
 import shapely.affinity
 
-from pipelines.adjust.relative import Solved
 from pipelines.change.datum import load_epoch
 from pipelines.change.options import ChangeOptions
 from pipelines.change.stage import run
-from pipelines.change.tied import contradicted, tied_by
+from pipelines.change.tied import Contradicted, Surfaces, Tied, contradicted, tied_by
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import COMMON_POINTS, MODEL, SIM3
+from pipelines.core.stages import COMMON_POINTS, MODEL
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.geotiff import read_cells
 from pipelines.geodesy.crs import parse_crs
-from pipelines.survey.adjustment import InitialSimilarity
 from pipelines.survey.change_report import Change, ChangedRegion
-from pipelines.survey.common_points import CommonPoints, solution_hash
-from pipelines.survey.trained_model import TrainedModel
-from tests.change_pairs import TownPair, town_pair
-from tests.trained_workspaces import trained_workspace, write_adjustment
+from pipelines.survey.common_points import CommonPoints
+from pipelines.survey.solution import TrainedModel
+from tests.change_pairs import TownPair, tie, town_pair
+from tests.refusals import refused
+from tests.trained_workspaces import trained_workspace
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def tie(after: Workspace, before: Workspace) -> None:
-    """Adjust an epoch onto another, all points of which it has in common."""
-    epoch = load_epoch(before)
-    date = Solved(epoch.posterior, epoch.survey.origin_on_earth)
-    ids = epoch.posterior.sparse.point_id
-    position, cov = date.placed(ids)
-    similarity, pivot = date.similarity_in_ecef
-    CommonPoints(
-        point_id=ids,
-        earlier_point_id=ids,
-        matches=np.full(len(ids), 3),
-        position_in_ecef=position,
-        cov_in_ecef=cov,
-        sigma_m=date.sigma_m,
-        cov_similarity=similarity,
-        pivot_in_ecef=pivot,
-        spread=np.asarray(1.0),
-        found=np.asarray(len(ids)),
-        factor=np.asarray(1.0),
-        checked=np.asarray(True),
-        earlier=str(before.root),
-        solution=solution_hash(before),
-    ).save(after.root / COMMON_POINTS)
-    initial = load_json(InitialSimilarity, after.path(SIM3))
-    save_json(initial.model_copy(update={"tied": True}), after.root / SIM3)
-    write_adjustment(after)
 
 
 def test_steps_add_up(tmp_path: Path) -> None:
@@ -114,7 +86,21 @@ def test_tied_epochs_need_no_registration(pair: TownPair, tmp_path: Path) -> Non
     assert summary.values["common"] == change.common.model_dump()
 
 
+def region_of(name: str, net_m3: float, area_m2: float = 100.0) -> ChangedRegion:
+    return ChangedRegion(
+        name=name,
+        area_m2=area_m2,
+        cut_m3=max(-net_m3, 0.0),
+        fill_m3=max(net_m3, 0.0),
+        net_m3=net_m3,
+        sigma_m3=1.0,
+        lowest_m=0.0,
+        highest_m=0.5,
+    )
+
+
 def test_points_that_stand_still_contradict_a_region(tmp_path: Path) -> None:
+    """Surfaces that differ by 0.4 m, around points that lie where they lay, to millimetres."""
     spring, autumn = (trained_workspace(tmp_path / name)[1] for name in ("spring", "autumn"))
     tie(autumn, spring)
     tied, _ = tied_by((load_epoch(spring), load_epoch(autumn)), (spring, autumn))
@@ -123,16 +109,76 @@ def test_points_that_stand_still_contradict_a_region(tmp_path: Path) -> None:
     plan = crs.xyz_from_lla(tied.lla())[:, :2]
     around = shapely.MultiPoint(plan).convex_hull.buffer(1.0)
     aside = shapely.affinity.translate(around, xoff=1000.0)
-    region = ChangedRegion(
-        name="R1", area_m2=100.0, cut_m3=0.0, fill_m3=40.0, net_m3=40.0, sigma_m3=1.0, lowest_m=0.0, highest_m=0.5
+
+    def judged(
+        net_m3: float, polygon: object = around, *, risen_m: float = 0.4, length_m: float = 20.0, of: object = tied
+    ) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        surfaces = Surfaces(crs, lambda places: np.full(len(places), risen_m), length_m)
+        found = contradicted(of, (region_of("R1", net_m3),), (polygon,), surfaces)  # type: ignore[arg-type]
+        return found.whole, found.part
+
+    assert judged(40.0) == ((0,), ())
+    assert judged(-40.0, risen_m=-0.4) == ((0,), ())
+    assert judged(40.0, aside) == ((), ())
+    # Points at the faint rim of a change of 0.4 m say nothing of it.
+    assert judged(40.0, risen_m=0.1) == ((), ())
+    assert judged(40.0, risen_m=np.nan) == ((), ())
+    # Errors over a tenth of a metre: each point speaks for itself alone.
+    assert judged(40.0, length_m=0.1) == ((), (0,))
+    assert (
+        contradicted(
+            tied, (region_of("P1", 40.0),), (around,), Surfaces(crs, lambda at: np.full(len(at), 0.4), 20.0)
+        )
+        == Contradicted()
     )
-    flat = region.model_copy(update={"name": "R2", "fill_m3": 0.01, "net_m3": 0.01})
-    given = region.model_copy(update={"name": "P1"})
-    regions, polygons = (region, region.model_copy(update={"name": "R3"}), given), (around, aside, around)
-    assert contradicted(tied, regions, polygons, crs) == ["R1"]
-    # The points' own noise, of centimetres, says nothing of a change of a tenth of a millimetre.
-    up = abs(float(np.median(tied.missed_m[tied.used, 2])))
-    assert contradicted(tied, (flat,), (around,), crs) == (["R2"] if up < 5e-5 else [])
+    # Most points have moved with the surface, whether they tie the dates or not.
+    (step,) = tied.steps
+    missed = step.relative.missed_m.copy()
+    missed[: 2 * len(missed) // 3, 2] = 0.4
+    moved = replace(step, relative=replace(step.relative, missed_m=missed, used=missed[:, 2] < 0.2))
+    assert judged(40.0, of=Tied((moved,))) == ((), ())
+    # The change may have happened in the step in which they moved.
+    assert judged(40.0, of=Tied((step, moved))) == ((), ())
+    assert judged(40.0, of=Tied((step, step))) == ((0,), ())
+
+
+def test_a_doubtful_region_is_no_change(pair: TownPair, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The largest of four regions is contradicted, the next in a part: names, sums, classes and files follow."""
+    before, after = pair.workspaces
+    monkeypatch.setattr("pipelines.change.stage.contradicted", lambda *_: Contradicted())
+    every, _ = compared(before, after, tmp_path / "every")
+    monkeypatch.setattr("pipelines.change.stage.contradicted", lambda *_: Contradicted((0,), (1,)))
+    change, summary = compared(before, after, tmp_path / "out")
+    assert [region.name for region in change.regions] == ["R1", "R2", "R3"]
+    assert [(region.name, region.reason) for region in change.doubtful] == [("D1", "region-contradicted")]
+    assert [region.net_m3 for region in (*change.doubtful, *change.regions)] == [
+        region.net_m3 for region in every.regions
+    ]
+    assert change.found.net_m3 == pytest.approx(sum(region.net_m3 for region in change.regions))
+    classes = [read_cells(tmp_path / name / "significant.tif")[0] for name in ("every", "out")]
+    moved = classes[1] == 4
+    assert moved.any()
+    assert np.isin(classes[0][moved], (2, 3)).all()
+    np.testing.assert_array_equal(classes[0][~moved], classes[1][~moved])
+    assert 0 < change.doubtful_share < 1
+    assert change.significant_share == pytest.approx((1 - change.doubtful_share) * every.significant_share)
+    told = {remark.code: remark.sentence for remark in summary.warnings}
+    assert "D1" in told["region-contradicted"]
+    assert "R1" in told["region-partly-contradicted"]
+    assert summary.values["doubtful_regions"] == 1
+    for name, names in (("doubtful", ["D1"]), ("regions", ["R1", "R2", "R3"])):
+        features = json.loads((tmp_path / f"out/{name}.geojson").read_text("utf-8"))["features"]
+        assert [one["properties"]["name"] for one in features] == names
+    assert 'id="region-D1"' in (tmp_path / "out/change.html").read_text("utf-8")
+
+
+def test_points_of_another_sfm_are_stale(pair: TownPair, tmp_path: Path) -> None:
+    before, after = pair.workspaces
+    common = CommonPoints.load(after.path(COMMON_POINTS))
+    for name in ("point_id", "earlier_point_id"):
+        replace(common, **{name: getattr(common, name) + 1000}).save(after.root / COMMON_POINTS)
+        with refused("common-points-stale"):
+            compared(before, after, tmp_path / name)
 
 
 def test_either_order_is_recognised_and_another_solution_is_not(pair: TownPair, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
 from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed, write_gaussians
 from pipelines.splat.sh import sh_from_rgb
-from pipelines.survey.trained_model import Adjustment, TrainedModel
+from pipelines.survey.solution import Solution, TrainedModel
 from tests.refusals import logged_codes, refused
 from tests.splat_scenes import (
     TEST_VIEWS,
@@ -74,7 +74,7 @@ def write_littered(root: Path, rendered: Rendered, floaters: dict[str, Gaussians
     """Write the true Gaussians as a trained model, with floaters, given in `geo`, behind them."""
     write_photographs(rendered, root / "photos")
     workspace = write_rendered(root, rendered)
-    solved = load_json(Adjustment, workspace.path(ADJUSTMENT))
+    solved = load_json(Solution, workspace.path(ADJUSTMENT))
     parts, rows, first = [rendered.gaussians], {}, len(rendered.gaussians)
     for name, some in floaters.items():
         parts.append(some)

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from pipelines.core.products import load_json, save_json, save_npz
-from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, REPORT, SIM3, SPARSE, SURVEY
+from pipelines.core.stages import ADJUSTMENT, BY_NAME, GAUSSIANS, MODEL, POINTS, REPORT, SPARSE, SURVEY
 from pipelines.geometry.similarity import Similarity
 from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.survey import Survey
@@ -21,6 +21,8 @@ from tests.cli_runs import Georef, products_in, write_files
 from tests.photos import jpeg
 from tests.refusals import numbers
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of, trained_model, write_workspace
+
+pytestmark = pytest.mark.usefixtures("children_here")
 
 
 @pytest.fixture
@@ -38,8 +40,8 @@ def made(tmp_path: Path) -> Path:
         ("sfm", "ingest", SURVEY, "ingest"),
         ("geolocate", "sfm", SPARSE, "sfm"),
         ("init-sim3", "geolocate", POINTS, "geolocate"),
-        ("train", "sim3", SIM3, "init-sim3"),
-        ("evaluate", "sim3", SIM3, "init-sim3"),
+        ("train", "sim3", ADJUSTMENT, "init-sim3"),
+        ("evaluate", "sim3", ADJUSTMENT, "init-sim3"),
         ("export-ply", "train", MODEL, "train"),
     ],
 )
@@ -58,7 +60,7 @@ DAMAGED = (
     ("geolocate", f"{SPARSE}/images.bin", b"\xff" * 40, None, "file-cut-off"),
     ("geolocate", f"{SPARSE}/cameras.bin", b"", None, "file-cut-off"),
     ("init-sim3", POINTS, b"PK\x03\x04", None, "npz-damaged"),
-    ("train", SIM3, b"[]", None, "product-invalid"),
+    ("train", ADJUSTMENT, b"[]", None, "product-invalid"),
     ("evaluate", MODEL, b'{"format_version": 1}', "geo_from_model", "product-invalid"),
     ("export-ply", MODEL, b"nonsense", None, "product-invalid"),
 )
@@ -109,7 +111,7 @@ def test_report_that_was_replaced(real_georef: Georef, made: Path, content: byte
     result = real_georef("evaluate", made)
     result.assert_failed(1, "report-invalid")
     assert result.error is not None and result.error["path"] == str(made / REPORT)
-    assert "`georef evaluate --force`" in result.error["message"]
+    assert "`georef evaluate --force`" in result.error["remedy"]
     assert (made / REPORT).read_bytes() == content
 
 
@@ -169,7 +171,7 @@ def test_import_of_a_project_and_of_a_forged_track(real_georef: Georef, made: Pa
     (model / "points3D.bin").write_bytes(points)
     result = real_georef("sfm", made, "--import", project, "--force")
     result.assert_failed(1)
-    assert "points3D.bin: the file is shorter than its number of records" in result.err.splitlines()[-1]
+    assert "points3D.bin: The file is shorter than its number of records" in result.err.splitlines()[-1]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pipes in folders")
@@ -199,11 +201,11 @@ def test_import_of_another_flight(real_georef: Georef, made: Path) -> None:
 def test_residual_larger_than_allowed(real_georef: Georef, made: Path) -> None:
     assert real_georef("geolocate", made).code == 0
     assert real_georef("init-sim3", made).code == 0
-    before = (made / SIM3).read_bytes()
+    before = (made / ADJUSTMENT).read_bytes()
     result = real_georef("init-sim3", made, "--max-residual", "0.000001")
     result.assert_failed(1)
     assert "--max-residual" in result.err.splitlines()[-1]
-    assert (made / SIM3).read_bytes() == before
+    assert (made / ADJUSTMENT).read_bytes() == before
 
 
 def test_photographs_that_are_gone(real_georef: Georef, made: Path) -> None:

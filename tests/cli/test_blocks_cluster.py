@@ -1,4 +1,4 @@
-"""`georef blocks --cluster` on a scheduler and two workers that are killed: real blocks of a small field."""
+"""`georef train --blocks --cluster` on a scheduler and two workers that are killed: blocks of a small field."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def field(tmp_path: Path) -> Workspace:
 
 
 def blocks(cluster: RunningCluster, field: Workspace) -> subprocess.Popen[str]:
-    return start("blocks", field.root, *OPTIONS, *cluster.words, code=PLAIN)
+    return start("train", field.root, *OPTIONS, *cluster.words, code=PLAIN)
 
 
 def begun(field: Workspace) -> dict[int, int]:
@@ -109,7 +109,7 @@ def test_a_killed_driver_leaves_only_what_is_missing(tmp_path: Path, field: Work
 
 def test_a_block_that_always_crashes_is_named(tmp_path: Path, field: Workspace) -> None:
     """The others finish, and the exit code is 1."""
-    crashing = f"import os, sys\nif '--id 2' in ' '.join(sys.argv): os.abort()\n{PLAIN}"
+    crashing = f"import os, sys\nif '--part 2' in ' '.join(sys.argv): os.abort()\n{PLAIN}"
     with running_cluster(tmp_path, crashing) as cluster:
         ended = finish_patiently(blocks(cluster, field))
     ended.assert_failed(1)

@@ -129,12 +129,12 @@ class TestRunOptions:
 
 class TestFlags:
     def test_file_decides_where_no_flag_is_given(self, georef: Georef, done: Path) -> None:
-        (done / "georef.toml").write_text("[train]\nseed = 4\ngeo_loss = false\n")
+        (done / "georef.toml").write_text("[train]\nseed = 4\ndistance_loss = false\n")
         georef("train", done)
-        georef("train", done, "--geo-loss", "--checkpoint-every", 9)
+        georef("train", done, "--distance-loss", "--checkpoint-every", 9)
         manifest = Workspace(done).manifest(BY_NAME["train"])
         assert manifest is not None
-        assert (manifest.config["seed"], manifest.config["geo_loss"]) == (4, True)
+        assert (manifest.config["seed"], manifest.config["distance_loss"]) == (4, True)
         assert manifest.config["checkpoint_every"] == 9
 
     def test_repeated_option(self, georef: Georef, done: Path, photos: Path) -> None:

@@ -83,13 +83,13 @@ def test_each_configuration_is_what_the_method_says(georef: Georef, survey: Path
     assert georef("compare", survey).code == 0
     train = {name: options_of(survey, name) for name in ("baseline", "A", "C", "D", "E")}
     assert not (survey / "compare/B/train").exists()  # its Gaussians are those of A
-    losses = ("optimize_cameras", "geo_loss", "gcp_loss", "distance_loss", "geo_schedule")
+    losses = ("georeference", "gcp_loss", "distance_loss", "geo_schedule")
     assert {name: tuple(options[loss] for loss in losses) for name, options in train.items()} == {
-        "baseline": (False, False, False, False, "constant"),
-        "A": (False, False, False, False, "constant"),
-        "C": (True, True, False, False, "constant"),
-        "D": (True, True, True, True, "constant"),
-        "E": (True, True, True, True, "rising"),
+        "baseline": ("frozen", False, False, "constant"),
+        "A": ("frozen", False, False, "constant"),
+        "C": ("joint", False, False, "constant"),
+        "D": ("joint", True, True, "constant"),
+        "E": ("joint", True, True, "rising"),
     }
     start = {name: options_of(survey, name, "sim3") for name in "ABCDE"}
     assert {name: (options["method"], options["control_points"]) for name, options in start.items()} == {
@@ -112,10 +112,10 @@ def test_variants_read_what_is_theirs(georef: Georef, survey: Path) -> None:
 
     trained = {name: digest(f"compare/{name}/train") for name in ("baseline", "A", "E")}
     assert trained["A"]["sfm/sparse"] == trained["E"]["sfm/sparse"] != trained["baseline"]["sfm/sparse"]
-    assert len({inputs["sim3/geo_from_local.json"] for inputs in trained.values()}) == 3
+    assert len({inputs["sim3/adjustment.json"] for inputs in trained.values()}) == 3
     evaluated = {name: digest(f"compare/{name}/evaluate") for name in "AB"}
     assert evaluated["A"]["train/gaussians.ply"] == evaluated["B"]["train/gaussians.ply"]
-    assert evaluated["A"]["sim3/geo_from_local.json"] != evaluated["B"]["sim3/geo_from_local.json"]
+    assert evaluated["A"]["sim3/adjustment.json"] != evaluated["B"]["sim3/adjustment.json"]
 
 
 def test_one_alone_runs_only_what_it_needs(georef: Georef, survey: Path) -> None:
@@ -155,12 +155,12 @@ def test_options_reach_all_trainings_and_are_remembered(georef: Georef, survey: 
 
 def test_training_is_asked_for_as_before_but_for_what_makes_the_configuration(georef: Georef, survey: Path) -> None:
     georef("init-sim3", survey)
-    assert georef("train", survey, "--preset", "fast", "--no-geo-loss").code == 0
+    assert georef("train", survey, "--preset", "fast", "--georeference", "frozen").code == 0
     own = '[init-sim3]\nmethod = "paper"\nmax_residual = 1.0\n[train]\nsh_degree = 1\n'
     (survey / "georef.toml").write_text(own, encoding="utf-8")
     assert georef("compare", survey, "--configs", "E").code == 0
     options = options_of(survey, "E")
-    assert (options["preset"], options["sh_degree"], options["geo_loss"]) == ("fast", 1, True)
+    assert (options["preset"], options["sh_degree"], options["georeference"]) == ("fast", 1, "joint")
     start = options_of(survey, "E", "sim3")
     assert (start["method"], start["max_residual"]) == ("robust", None)
 
@@ -170,7 +170,15 @@ def test_bad_option_is_refused_before_anything_runs(georef: Georef, survey: Path
     assert result.code == 2
     assert "--iterations" in result.err
     assert not (survey / "compare").exists()
-    assert georef("compare", survey, "--no-geo-loss").code == 2  # makes configurations: not for the user to set
+    # What makes the configurations is not for the user to set.
+    assert georef("compare", survey, "--no-gcp-loss").code == 2
+    frozen = georef("compare", survey, "--georeference", "frozen", "--json")
+    assert (frozen.code, frozen.document["error"]["code"]) == (2, "georeference-frozen")
+
+
+def test_the_papers_losses_are_those_of_all_that_train_the_cameras(georef: Georef, survey: Path) -> None:
+    assert georef("compare", survey, "--configs", "A,D", "--georeference", "paper").code == 0
+    assert [options_of(survey, name)["georeference"] for name in "AD"] == ["frozen", "paper"]
 
 
 def test_changed_survey_makes_everything_again(georef: Georef, survey: Path) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.core import child
+from pipelines.splat.kernel_cache import cache_folder
 from tests.block_scenes import make_field, write_field
 from tests.cli_runs import REPOSITORY, finish
 from tests.photos import write_flight
@@ -43,14 +44,18 @@ def poisoned(tmp_path: Path) -> Path:
 
 
 def start_in(folder: Path, *arguments: object, way: Sequence[str] = ()) -> subprocess.Popen[str]:
-    """Start `georef` in a folder, by default as its installed script: with the script's folder on the path."""
+    """Start `georef` in a folder, by default as its installed script: with the script's folder on the path.
+
+    Home is another, in which nobody would find the kernels that are compiled.
+    """
+    homes = {"HOME": str(folder.parent), "NUMBA_CACHE_DIR": str(cache_folder())}
     return subprocess.Popen(
         [sys.executable, *(way or [str(folder.parent / "bin/georef")]), *map(str, arguments)],
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY), "HOME": str(folder.parent)},
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY), **homes},
     )
 
 
@@ -121,7 +126,7 @@ def test_blocks(poisoned: Path) -> None:
         "--no-geometry-regularisation",
         "--no-dense",
     )
-    ended = finish(start_in(poisoned, "blocks", field.root, "--blocks", 2, "--iterations", 20, *few), 300)
+    ended = finish(start_in(poisoned, "train", field.root, "--blocks", 2, "--iterations", 20, *few), 300)
     assert_not_run(poisoned)
     assert ended.code == 0, ended.err
 

@@ -243,7 +243,7 @@ class TestCostModel:
     def test_iterations_take_the_time_of_the_benchmarks(
         self, gaussians: int, pixels: int, photographs: int, seconds: float
     ) -> None:
-        """Within 20 %; over the whole table of docs/benchmarks.md the fit deviates by up to 21 %."""
+        """Within 20 %; over all of examples/benchmarks/results/training.md the fit deviates by up to 21 %."""
         assert iteration_seconds(pixels, gaussians, photographs, surface=False) == pytest.approx(seconds, rel=0.2)
 
 

@@ -30,17 +30,17 @@ def test_error_of_a_file_names_path_line_and_field(georef: Georef, done: Path, t
     result.assert_failed(1)
     assert result.document["error"] == {
         "kind": "input", "code": "east-no-number", "message": "'east' is no number", "path": "t.csv", "line": 5,
-        "field": "longitude", "hint": None,
+        "field": "longitude", "remedy": None,
     }  # fmt: skip
     assert result.err.splitlines()[-1] == "error: t.csv:5 [longitude]: 'east' is no number"
 
 
-def test_missing_product_hints_at_the_command(georef: Georef, workspace: Workspace, photos: Path) -> None:
+def test_missing_product_names_the_command(georef: Georef, workspace: Workspace, photos: Path) -> None:
     georef("ingest", workspace.root, "--images", photos)
     result = georef("train", workspace.root, "--json")
     result.assert_failed(1)
     error = result.document["error"]
-    assert (error["code"], error["hint"]) == ("missing-product", f"run `georef sfm {workspace.root}` first")
+    assert (error["code"], error["remedy"]) == ("missing-product", f"Run `georef sfm {workspace.root}` first.")
 
 
 def test_deliverables_of_a_run_that_ends_before_training(georef: Georef, workspace: Workspace) -> None:

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import click
 import pytest
+from click.core import ParameterSource
 
-from georef_cli.main import COMMANDS, cli
+from georef_cli.command import COMMANDS
+from georef_cli.main import cli
 from tests.cli_runs import Georef
 
 REPOSITORY = Path(__file__).parents[2]
@@ -31,14 +33,22 @@ def examples_in(text: str) -> list[str]:
     return [line.strip().removeprefix("$ ") for line in joined.splitlines() if re.match(r"\s*(\$ )?georef ", line)]
 
 
-def parse(line: str) -> None:
-    """Parse a command line as click would, without running it."""
+def unheard(line: str) -> list[str]:
+    """Parse a command line as click would, and run nothing; return its options that did not reach the command."""
     words = shlex.split(line.partition(" | ")[0].partition(" > ")[0], comments=True)[1:]
     spans = [(start, start + count) for start in range(len(words)) for count in (2, 1)]
     start, end = next(span for span in spans if " ".join(words[slice(*span)]) in COMMANDS)
     name = " ".join(words[start:end])
     context = cli.make_context("georef", words[:end])
-    command_of(name).make_context(name, words[end:], parent=context)
+    parsed = command_of(name).make_context(name, words[end:], parent=context)
+    heard = {
+        option
+        for parameter in parsed.command.params
+        if parsed.get_parameter_source(str(parameter.name)) is ParameterSource.COMMANDLINE
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    }
+    options = [word.partition("=")[0] for word in words[end:] if word.startswith("--")]
+    return [option for option in options if option not in heard]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -56,7 +66,7 @@ def test_command_explains_itself(name: str) -> None:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_examples_of_the_help_parse(name: str) -> None:
     for line in examples_in(command_of(name).help or ""):
-        parse(line)
+        assert unheard(line) == [], line
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
@@ -65,7 +75,7 @@ def test_examples_of_the_documents_parse(document: Path) -> None:
     blocks = re.findall(r"^```(?:sh|console|bash|text)?\n(.*?)^```", text, re.M | re.S)
     for line in [example for block in blocks for example in examples_in(block)]:
         with contextlib.suppress(click.exceptions.Exit):  # --help and --version end here
-            parse(line)
+            assert unheard(line) == [], line
 
 
 def test_commands_document_is_current() -> None:

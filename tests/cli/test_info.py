@@ -82,7 +82,7 @@ def test_command_names_what_is_missing(real_georef: Georef, flight: Workspace, t
 
 
 def test_run_ends_with_where_the_files_are(flight: Workspace, capsys: pytest.CaptureFixture[str]) -> None:
-    print_outcomes(flight, (), overview(flight, CrsOptions(crs="EPSG:4326")), as_json=False, told=False)
+    print_outcomes(flight, (), overview(flight, CrsOptions(crs="EPSG:4326")), as_json=False, logged=False)
     out = " ".join(capsys.readouterr().out.split())
     for text in (
         "at 46.00",

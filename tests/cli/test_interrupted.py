@@ -69,7 +69,7 @@ def test_other_inputs_are_refused(georef: Georef, interrupted: Path) -> None:
     assert_refused(
         georef("run", interrupted),
         interrupted,
-        "sim3/adjustment.json, sim3/adjustment.npz, sim3/geo_from_local.json changed",
+        "sim3/adjustment.json, sim3/adjustment.npz changed",
     )
 
 

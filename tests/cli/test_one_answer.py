@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from georef_cli import job_tables
+from georef_cli.commands.batch import batch_tables
 from georef_cli.output import print_outcomes, print_rich
 from pipelines.core.figures import Headline
 from pipelines.core.fingerprints import fingerprints, hashes_of
@@ -33,7 +33,7 @@ from pipelines.core.stages import (
     TRAIN_POSTERIOR,
 )
 from pipelines.core.workspace import StageRun, Summary, Workspace
-from pipelines.deliver import cameras, ply, spz, tiles
+from pipelines.deliver import cameras, ply, sog, spz, tiles
 from pipelines.deliver.overview import overview
 from pipelines.formats.colmap import write_sparse
 from pipelines.jobs.batch import BatchTable, mission_row, write_batch
@@ -85,21 +85,22 @@ def test_it_is_the_same_everywhere(
     truth = true_headline(flight)
     assert (stated.rmse_h_m, stated.rmse_v_m) == pytest.approx((truth.rmse_h_m, truth.rmse_v_m), rel=1e-12)
     text, figures = truth.text, stated.model_dump(mode="json")
-    assert re.fullmatch(r"measured at 3 check points, triangulated: RMSE H \d\.\d cm, V \d\.\d cm", text)
+    of_points = "measured at 3 check points, triangulated, with the error of their survey"
+    assert re.fullmatch(rf"{of_points}: RMSE H \d\.\d cm, V \d\.\d cm", text)
 
     # In JSON, to the last digit.
     assert real_georef("status", flight.root, "--json").document["accuracy"] == figures
     assert real_georef("info", flight.root, "--json").document["properties"]["quality"]["accuracy"] == figures
-    runs = {"ply": ply.run, "spz": spz.run, "tiles": tiles.run, "cameras": cameras.run}
+    runs = {"ply": ply.run, "spz": spz.run, "sog": sog.run, "tiles": tiles.run, "cameras": cameras.run}
     folders = {name: made(flight, f"export-{name}", run) for name, run in runs.items()}
     sidecars = [path for folder in folders.values() for path in folder.rglob("*.georef.json")]
-    assert len(sidecars) == 11
-    assert [json.loads(path.read_text("utf-8"))["accuracy"] for path in sidecars] == [figures] * 11
+    assert len(sidecars) == 12
+    assert [json.loads(path.read_text("utf-8"))["accuracy"] for path in sidecars] == [figures] * 12
 
     # In text, to the digit that is shown.
     page = (made(flight, "report", report.run) / "report.html").read_text("utf-8")
     tiles_page = (folders["tiles"] / "index.html").read_text("utf-8")
-    print_outcomes(flight, [], overview(flight, CrsOptions()), as_json=False, told=True)
+    print_outcomes(flight, [], overview(flight, CrsOptions()), as_json=False, logged=True)
     end_of_run = capsys.readouterr().out
     mission = Mission("flight", flight, "flight")
     table = BatchTable(batch="b", missions=(mission_row(mission, "done"),))
@@ -114,7 +115,7 @@ def test_it_is_the_same_everywhere(
     ):
         assert text in " ".join(where.split())
     write_batch(tmp_path, table)
-    print_rich(*job_tables.batch(table, tmp_path))
+    print_rich(*batch_tables(table, tmp_path))
     horizontal, vertical = re.findall(r"[HV] (\d\.\d) cm", text)
     assert re.search(rf"measured +{horizontal} cm +{vertical} cm +3", capsys.readouterr().out)
     for html in ((tmp_path / "b.batch.html").read_text("utf-8"), page):
@@ -155,8 +156,17 @@ def test_without_check_points_it_is_predicted_and_called_so() -> None:
     points = check_points_with(count=1, with_survey=total)
     assert (
         headline(points, scene, UNCHECKED).text
-        == "measured at 1 check point, triangulated: RMSE H 3.0 cm, V 4.0 cm"
+        == "measured at 1 check point, triangulated, with the error of their survey: RMSE H 3.0 cm, V 4.0 cm"
     )
+
+
+def test_blunders_that_count_are_told_from_those_that_are_refuted() -> None:
+    total = TotalRmse(rmse_h_m=0.03, rmse_v_m=0.04, rmse_3d_m=0.05)
+    named = {"blunders": ("G1", "G2", "G3"), "refuted": ("G2",), "with_survey_without_refuted": total}
+    stated = headline(
+        check_points_with(count=9, with_survey=total, **named), AccuracySummary(cells=0, reason=None), ()
+    )
+    assert (stated.beyond_class, stated.blunders, stated.vegetated) == (2, ("G2",), 0)
 
 
 def test_before_evaluation_the_adjustment_predicts_it(real_georef: Georef, flight: Workspace) -> None:

@@ -23,19 +23,19 @@ from scipy.spatial.transform import Rotation
 from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.system import NormalMatrix
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import GAUSSIANS, MODEL, REPORT, SIM3, SPARSE, SURVEY, TRAIN_POSTERIOR
+from pipelines.core.stages import GAUSSIANS, MODEL, REPORT, SPARSE, SURVEY, TRAIN_POSTERIOR
 from pipelines.formats.colmap import read_sparse, write_sparse
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.gaussians import Gaussians, write_gaussians
+from pipelines.survey.solution import SolvedCamera, TrainedModel
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_model import TrainedCamera, TrainedModel
 from tests.cli_runs import Georef
 from tests.map_projections import US_FOOT_M, long_island, utm
 from tests.photos import jpeg
 from tests.refusals import codes
-from tests.scenes import initial_product, trained_model
+from tests.scenes import trained_model
 
 CAMERA = Camera("PINHOLE", 64, 48, np.array([40.0, 40.0, 32.0, 24.0]))
 HALF_M, HEIGHT_M = 5_000.0, 60.0
@@ -167,7 +167,7 @@ def write_perfect_model(root: Path, made: Site) -> None:
         root / SPARSE,
     )  # fmt: skip
     cameras = tuple(
-        TrainedCamera(
+        SolvedCamera(
             name=name,
             split="train",
             quat_xyzw=tuple(Rotation.from_matrix(rotation).as_quat().tolist()),
@@ -178,8 +178,6 @@ def write_perfect_model(root: Path, made: Site) -> None:
     model = trained_model(Similarity(translation=shift), max_image_size=64, cameras=cameras)
     save_json(model, root / MODEL)
     write_flawless_posterior(root, model)
-    start = Similarity(translation=shift).to_record("local", "geo", covariance=1e-6 * np.eye(7))
-    save_json(initial_product(start), root / SIM3)
     # One far from everything: on the rendered surface, no point is found.
     speck = Gaussians(
         torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3)

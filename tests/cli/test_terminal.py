@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.core.sentences import printable, printable_lines
-from tests.cli_runs import REPOSITORY, WITH_FAKES
+from tests.cli_runs import REPOSITORY, WITH_FAKES, Georef
 
 ATTACK = "\x1b[31m\x1b]0;title\x07\x9b2J\u202egpj\u2066\r\nerror: forged"
 UNSAFE = (b"\x1b", b"\x07", "\x9b".encode(), "\u202e".encode(), "\u2066".encode(), b"\r")
@@ -91,14 +91,15 @@ def test_printable(text: str, safe: str) -> None:
 @pytest.mark.parametrize(
     "name", [os.fsdecode(b"caf\xe9"), "a" * 300, "file/ws"], ids=["not UTF-8", "too long", "in a file"]
 )
-def test_workspace_that_cannot_be(tmp_path: Path, photos: Path, command: str, name: str) -> None:
+def test_workspace_that_cannot_be(tmp_path: Path, photos: Path, georef: Georef, command: str, name: str) -> None:
     (tmp_path / "file").write_text("")
     images = () if command == "status" else ("--images", photos)
-    result = run(command, tmp_path / name, *images, code=WITH_FAKES)
-    assert result.returncode == 1, result.stderr
-    lines = result.stderr.decode("utf-8").splitlines()
+    result = georef(command, tmp_path / name, *images)
+    assert result.code == 1, result.err
+    result.err.encode("utf-8")
+    lines = result.err.splitlines()
     assert [line.startswith("error: ") for line in lines] == [True], lines
-    assert result.stdout == b""
+    assert result.out == ""
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems refuse such names themselves")

@@ -16,12 +16,11 @@ from pipelines.compare.configurations import CONFIGURATIONS, select_configuratio
 from pipelines.compare.stage import ComparedStage, compare
 from pipelines.compare.table import ComparedRow, Comparison
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import GAUSSIANS, REPORT, SIM3, SURVEY
+from pipelines.core.stages import ADJUSTMENT, GAUSSIANS, REPORT, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
-from pipelines.survey.adjustment import InitialSimilarity
+from pipelines.survey.solution import Solution, read_trained
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_survey import load_trained
 from tests.splat_scenes import RenderedFlight
 
 pytest.importorskip("pycolmap")
@@ -114,14 +113,14 @@ def test_b_is_a_elsewhere_on_earth(compared: Compared) -> None:
     assert (rows["B"].test_psnr, rows["B"].gaussians) == (rows["A"].test_psnr, rows["A"].gaussians)
     shared = {folder: workspace.root / folder for folder in ("ingest", "sfm", "geolocate")}
     variant = Workspace(root / "B", workspace, {**shared, "train": root / "A/train"}, "compare")
-    here, there = load_trained(variant, "initial"), load_trained(variant)
-    initial = load_json(InitialSimilarity, root / "B" / SIM3)
+    here, there = read_trained(variant, "initial"), read_trained(variant)
+    initial = load_json(Solution, root / "B" / ADJUSTMENT).initial
     assert initial.method == "paper"
     # The same point of the SfM model lies where the paper's similarity says, whatever frame it was trained in.
-    geo_from_local = here.geo_from_model.apply(mapped(here.model.model_from_local))
+    geo_from_local = here.similarity.apply(mapped(here.model_from_local))
     np.testing.assert_allclose(geo_from_local, mapped(initial.geo_from_local), atol=1e-6)
-    assert np.abs(here.geo_from_model.translation - there.geo_from_model.translation).max() > 1e-3
-    assert here.model.geo_from_model.covariance == initial.geo_from_local.covariance
+    assert np.abs(here.similarity.translation - there.similarity.translation).max() > 1e-3
+    assert here.geo_from_model.covariance == initial.geo_from_local.covariance
 
 
 def test_what_is_shared_is_not_copied(compared: Compared) -> None:

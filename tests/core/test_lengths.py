@@ -53,3 +53,10 @@ def test_a_headline_with_a_blunder_has_both_figures() -> None:
     without = {"blunders": ("G7",), "rmse_h_without_m": 0.021, "rmse_v_without_m": 0.03}
     text = Headline(kind="measured", rmse_h_m=1.06, rmse_v_m=0.05, check_points=4, **without).text
     assert "RMSE H 1.06 m, V 5.0 cm" in text and "G7" in text and "RMSE H 2.1 cm, V 3.0 cm" in text
+
+
+def test_a_headline_states_its_points_and_their_measurement() -> None:
+    plain = Headline(kind="measured", rmse_h_m=0.032, rmse_v_m=0.05, check_points=47)
+    assert "47 check points, triangulated, with the error of their survey" in plain.text
+    text = plain.model_copy(update={"vegetated": 3, "beyond_class": 14}).text
+    assert "47 check points outside vegetation, triangulated" in text and "14 of them exceed three times" in text

@@ -49,6 +49,14 @@ def test_errors_name_place_and_key(
     assert known in error.value.message
 
 
+def test_an_option_that_an_earlier_version_remembered_is_said_to_be_deleted(tmp_path: Path) -> None:
+    requests = tmp_path / "requests.json"
+    requests.write_text('{"sfm": {"old_mapper": "best"}}', encoding="utf-8")
+    with refused("unknown-option", InputError) as error:
+        resolve(SfmOptions, {}, {"old_mapper": "best"}, tmp_path / "georef.toml")
+    assert (error.value.field, str(requests) in error.value.remedy) == ("--old-mapper", True)
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 0.0])
 def test_a_sigma_is_a_positive_number(value: float) -> None:
     with refused("option-invalid", InputError) as error:

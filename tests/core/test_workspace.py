@@ -19,7 +19,7 @@ from pipelines.core.errors import InputError, MissingProductError, WorkspaceBusy
 from pipelines.core.lock import WriteLock
 from pipelines.core.options import read_requests, remember
 from pipelines.core.plan import photograph_folder
-from pipelines.core.stages import BY_NAME, MODEL, PIPELINE, POINTS, SIM3, SPARSE, stage_slice
+from pipelines.core.stages import ADJUSTMENT, BY_NAME, MODEL, PIPELINE, POINTS, SPARSE, stage_slice
 from pipelines.core.workspace import Workspace
 from tests import fakes
 from tests.refusals import refused
@@ -243,11 +243,11 @@ def test_variant_reads_what_is_lent_and_writes_its_own(tmp_path: Path) -> None:
     workspace, elsewhere = Workspace(tmp_path / "flight"), tmp_path / "elsewhere"
     lent = {"sfm": workspace.root / "sfm", "geolocate": elsewhere}
     variant = Workspace(workspace.root / "compare/A", workspace, lent, "compare")
-    for path in (workspace.root / SPARSE, elsewhere / "points.npz", variant.root / SIM3):
+    for path in (workspace.root / SPARSE, elsewhere / "points.npz", variant.root / ADJUSTMENT):
         path.mkdir(parents=True)
     assert variant.path(SPARSE) == workspace.root / SPARSE
     assert variant.path(POINTS) == elsewhere / "points.npz"
-    assert variant.path(SIM3) == variant.root / SIM3
+    assert variant.path(ADJUSTMENT) == variant.root / ADJUSTMENT
     assert variant.partial(TRAIN).parent == variant.root == workspace.root / "compare/A"
     assert variant.cache == workspace.cache
     assert {row.stage: row.state for row in states.status(variant)}["sfm"] == "current"

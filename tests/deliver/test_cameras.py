@@ -28,8 +28,8 @@ from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.sfm.imported_model import import_model, import_poses
 from pipelines.survey.photographs import covered_pinhole
+from pipelines.survey.solution import SolvedLens, TrainedModel
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_model import TrainedLens, TrainedModel
 from tests.oracles import map_from_cam
 from tests.scenes import TrueScene
 from tests.trained_workspaces import IMAGES, load_adjustment, scene_of, trained_workspace, untrained
@@ -220,7 +220,7 @@ def test_points_lie_at_their_dots_in_the_undistorted_photographs(tmp_path: Path)
     """The lens is the adjusted one: SfM's would miss the dots by pixels."""
     scene, workspace = trained_workspace(tmp_path / "ws")
     drawn_dots(scene, workspace.root)
-    lens = TrainedLens(camera_id=1, model=scene.camera.model, params=tuple(scene.camera.params.tolist()))
+    lens = SolvedLens(camera_id=1, model=scene.camera.model, params=tuple(scene.camera.params.tolist()))
     model = load_json(TrainedModel, workspace.path(MODEL))
     save_json(model.model_copy(update={"lenses": (lens,)}), workspace.path(MODEL))
     sparse = read_sparse(workspace.path(SPARSE))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,9 +15,12 @@ from plyfile import PlyData
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import load_json
+from pipelines.core.progress import SILENT
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, CLOUD
 from pipelines.core.workspace import Workspace
+from pipelines.deliver import surface
+from pipelines.deliver.surface import shared_squares
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.geodesy.enu import enu_from_ecef
 from pipelines.geometry.cameras import CameraPoses
@@ -45,11 +49,12 @@ def surface_views(folder: Path, offset_m: np.ndarray | float = 0.0) -> SurfaceVi
         return np.where(depth > 0, depth + np.float32(offset[index]), 0), rgb
 
     poses = CameraPoses(np.tile(DOWN, (len(CENTERS), 1, 1)), np.array(CENTERS))
-    trained = SimpleNamespace(
-        poses=poses, geo_from_model=GEO_FROM_MODEL, indices=lambda _split: list(range(len(CENTERS)))
-    )
     renderer: Any = SimpleNamespace(
-        trained=trained, images=None, pinholes=SimpleNamespace(of=lambda _index: CAMERA), surface=surface
+        model=SimpleNamespace(similarity=GEO_FROM_MODEL, indices=lambda _split: list(range(len(CENTERS)))),
+        poses=poses,
+        images=None,
+        pinholes=SimpleNamespace(of=lambda _index: CAMERA),
+        surface=surface,
     )
     return SurfaceViews(renderer, folder, colours=True)
 
@@ -127,6 +132,23 @@ def test_what_few_views_show_is_left_out(tmp_path: Path) -> None:
     assert len(cloud(surface_views(tmp_path / "again"), nine).position) == 0
 
 
+def test_the_fused_surface_is_shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second deliverable reads what the first one fused; other settings, another place, or a part are fused."""
+    views = surface_views(tmp_path)
+    next(shared_squares(views, GEO_FROM_MODEL, SETTINGS, SILENT))  # and no more: nothing is kept of a part
+    fused = list(fused_squares(views, GEO_FROM_MODEL, SETTINGS))
+    first = list(shared_squares(views, GEO_FROM_MODEL, SETTINGS, SILENT))
+    monkeypatch.setattr(surface, "fused_squares", lambda *_: iter(()))
+    again = list(shared_squares(views, GEO_FROM_MODEL, SETTINGS, SILENT))
+    assert len(fused) == len(first) == len(again) > 0
+    for parts in zip(fused, first, again, strict=True):
+        for name, values in vars(parts[0]).items():
+            assert all(np.array_equal(vars(part)[name], values) for part in parts)
+    elsewhere = replace(GEO_FROM_MODEL, scale=1.5)
+    assert not list(shared_squares(views, elsewhere, SETTINGS, SILENT))
+    assert not list(shared_squares(views, GEO_FROM_MODEL, replace(SETTINGS, min_views=4), SILENT))
+
+
 def test_pixel_on_the_ground_is_depth_over_focal_length(tmp_path: Path) -> None:
     assert pixel_on_surface_m(surface_views(tmp_path), GEO_FROM_MODEL) == pytest.approx(PIXEL_M, rel=1e-6)
 
@@ -145,6 +167,7 @@ def test_cloud_of_a_trained_survey_lies_on_its_ground(
     shutil.copytree(trained[0][0].root, root, symlinks=True)
     workspace = Workspace(root)
     values = run_stage(workspace, BY_NAME["export-cloud"], {"crs": "EPSG:4978", "ply": True}).manifest.values
+    assert len(list((workspace.cache / "rendered").iterdir())) == 1  # for the next deliverable
     files = {path.name for path in (root / "cloud").iterdir()}
     pair = {"cloud.laz", "cloud.laz.georef.json", "cloud.ply", "cloud.ply.georef.json"}
     assert files == pair | {"cloud.laz.iso.xml", "cloud.ply.iso.xml", "manifest.json"}

@@ -17,7 +17,7 @@ from pipelines.core.stages import BY_NAME, GAUSSIANS, MEASURABLE_SPLAT, SPLAT
 from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
 from pipelines.deliver import measurable
-from pipelines.deliver.measurable import with_discs
+from pipelines.deliver.measurable import passes_showing, with_discs
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
 from pipelines.geodesy.enu import enu_from_ecef
 from pipelines.geometry.cameras import Pinhole
@@ -131,6 +131,12 @@ def test_appearance_refinement_finds_the_colours_and_moves_nothing() -> None:
     ]
     # 240 iterations at falling rates from 0.01 move coefficients by up to 1.5, and colours by 0.4.
     assert error[1] < 0.1 * error[0]
+
+
+def test_a_disc_is_shown_as_often_whatever_the_overlap() -> None:
+    """Cost follows what there is to learn, not the overlap; each view counts, and few come seven times."""
+    for views_of_disc, passes in ((5.0, 7.0), (30.0, 5.0), (80.0, 1.875), (400.0, 1.0), (0.0, 7.0)):
+        assert passes_showing(views_of_disc) == pytest.approx(passes)
 
 
 @pytest.mark.slow

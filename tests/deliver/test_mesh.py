@@ -29,7 +29,7 @@ from pipelines.surface.mesh import (
     RawMesh,
     closed,
     compact,
-    distances,
+    distances_from_mesh,
     edges_of,
     holes_of,
     parts_of,
@@ -49,7 +49,7 @@ from pipelines.surface.poisson import (
     surface_sigma_at,
 )
 from pipelines.surface.surface_views import SurfaceViews
-from pipelines.surface.texture import colours_of, textured
+from pipelines.surface.texture import photographed_colours, textured
 from pipelines.survey.calibrated import load_survey
 from tests.depth_scenes import BOX_M, CAMERA, DOWN, UP, depth_map, looking_down
 from tests.refusals import refused
@@ -81,14 +81,14 @@ def surface_views(folder: Path, *, floater: bool = False) -> SurfaceViews:
     def surface(index: int) -> tuple[np.ndarray, np.ndarray]:
         return depth(index), photograph(index)
 
-    trained = SimpleNamespace(
-        poses=poses,
-        geo_from_model=GEO_FROM_MODEL,
+    model = SimpleNamespace(
+        similarity=GEO_FROM_MODEL,
         indices=lambda _split: list(range(len(CENTERS))),
-        model=SimpleNamespace(cameras=[SimpleNamespace(exposure=None)] * len(CENTERS)),
+        cameras=[SimpleNamespace(exposure=None)] * len(CENTERS),
     )
     renderer: Any = SimpleNamespace(
-        trained=trained,
+        model=model,
+        poses=poses,
         pinholes=SimpleNamespace(of=lambda _index: CAMERA),
         surface=surface,
         images=SimpleNamespace(image=photograph),
@@ -151,6 +151,7 @@ def test_walls_that_no_view_shows_are_closed(whole: RawMesh, simple: RawMesh) ->
     assert len(simple.faces) < len(whole.faces) / 3
 
 
+@pytest.mark.usefixtures("children_here")
 @pytest.mark.parametrize(("side_m", "spacing_m"), [(40.0, 0.25), (40.0, 0.5)])
 def test_narrow_gaps_are_closed_and_wide_ones_listed(side_m: float, spacing_m: float, tmp_path: Path) -> None:
     narrow, wide = 0.8 * closed_gap_m(spacing_m), 2 * closed_gap_m(spacing_m)
@@ -186,6 +187,7 @@ def test_uncertain_points_count_only_where_no_others_are() -> None:
         assert (sigma_m == 0.03).sum() <= len(used.position) < len(points.position)
 
 
+@pytest.mark.usefixtures("children_here")
 @pytest.mark.parametrize("sigma_m", [0.2, 0.4])
 def test_no_gap_is_left_before_uncertain_points(sigma_m: float, tmp_path: Path) -> None:
     """Ground whose east fewer photographs see, as beyond the edge of one: it is measured from end to end."""
@@ -218,6 +220,7 @@ def test_what_one_view_shows_is_left_out(tmp_path: Path) -> None:
     assert points.position[:, 2].max() - GEO_FROM_MODEL.translation[2] < BOX_M + PIXEL_M
 
 
+@pytest.mark.usefixtures("children_here")
 def test_steps_of_a_border_are_no_edges_of_the_simplified_mesh(tmp_path: Path) -> None:
     """Faces of a level grid that end at a slanted line: few edges along it are left, within a cell of it."""
     side, slope = 60, 0.37
@@ -239,7 +242,7 @@ def test_steps_of_a_border_are_no_edges_of_the_simplified_mesh(tmp_path: Path) -
     assert (after == 1).sum() < 0.15 * (before == 1).sum()
     off = (20 + slope * simple.vertices[:, 0] - simple.vertices[:, 1]) / np.hypot(1, slope)
     assert off.min() > -0.5  # beyond the line, by a part of a cell
-    assert distances(stepped.vertices, simple, 1.0).max() < 1.5
+    assert distances_from_mesh(stepped.vertices, simple, 1.0).max() < 1.5
 
 
 @pytest.mark.parametrize(("wave_m", "least", "most"), [(0.2, 8, 24), (2.0, 60, 120)])
@@ -261,21 +264,22 @@ def test_borders_lose_vertices_within_a_tolerance(wave_m: float, least: int, mos
     assert len(holes_of(found)) == 1
     assert (vertex_normals(found)[:, 2] > 0).all()  # no face has turned over
     border = np.unique(border_of(mesh))
-    assert distances(mesh.vertices[border], found, 0.1).max() <= 0.25 + 1e-9
+    assert distances_from_mesh(mesh.vertices[border], found, 0.1).max() <= 0.25 + 1e-9
 
 
+@pytest.mark.usefixtures("children_here")
 def test_simplification_keeps_its_error(tmp_path: Path) -> None:
     """A sphere of 5 m: the measured error is that of the chords; the bound is on distances from planes."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=5.0)
     mesh = RawMesh(np.array(ball.vertices), np.array(ball.faces, dtype=np.int64))
     for error_m in (0.01, 0.05):
         simple = simplified(mesh, error_m, tmp_path)
-        off = distances(mesh.vertices, simple, 0.1)
+        off = distances_from_mesh(mesh.vertices, simple, 0.1)
         inner = 5.0 - np.linalg.norm(simple.vertices[simple.faces].mean(axis=1), axis=1)
         assert 0.2 * inner.max() < off.max() < 10 * error_m
         assert np.sqrt(np.mean(off**2)) < error_m / 2
         assert len(simple.faces) < len(mesh.faces) / 2
-    np.testing.assert_allclose(distances(2 * mesh.vertices[:50], mesh, 0.1), 5.0, rtol=1e-6)
+    np.testing.assert_allclose(distances_from_mesh(2 * mesh.vertices[:50], mesh, 0.1), 5.0, rtol=1e-6)
 
 
 def test_watertight_mesh_is_a_solid(simple: RawMesh) -> None:
@@ -301,7 +305,7 @@ def test_islands_are_left_out() -> None:
 
 
 def test_colours_are_those_of_the_photographs(views: SurfaceViews, whole: RawMesh) -> None:
-    rgb, known = colours_of(whole.vertices, vertex_normals(whole), views, GEO_FROM_MODEL)
+    rgb, known = photographed_colours(whole.vertices, vertex_normals(whole), views, GEO_FROM_MODEL)
     at = whole.vertices - GEO_FROM_MODEL.translation
     # No view shows the walls, and few the ground around the views.
     reach = np.abs(at[:, :2]).max(axis=1)
@@ -370,6 +374,31 @@ def test_too_little_memory_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     # Voxels that nobody has stated become larger: a fourth of the points fits where the excess is four.
     excess = stage._memory_excess(10_000_000, 0.1, stated=False)
     assert stage._memory_excess(int(10_000_000 / excess), 0.1 * excess**0.5, stated=False) <= 1
+
+
+def test_edges_and_vertices_are_those_of_plain_sorting() -> None:
+    faces = np.random.default_rng(0).integers(0, 60, (200, 3))
+    mesh = RawMesh(np.random.default_rng(1).random((70, 3)), faces)
+    pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    for found, expected in zip(
+        edges_of(faces), np.unique(pairs, axis=0, return_inverse=True, return_counts=True)[1:], strict=True
+    ):
+        np.testing.assert_array_equal(found, expected.ravel())
+    used, of_used = np.unique(faces, return_inverse=True)
+    np.testing.assert_array_equal(compact(mesh).vertices, mesh.vertices[used])
+    np.testing.assert_array_equal(compact(mesh).faces, of_used.reshape(-1, 3))
+    assert len(edges_of(np.zeros((0, 3), np.int64))[1]) == 0
+
+
+@pytest.mark.parametrize(("faces", "double"), [(0, False), (7, True)])
+def test_mesh_files_are_those_that_plyfile_writes(faces: int, double: bool, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    write_mesh_ply(
+        tmp_path / "own.ply", rng.random((9, 3)), rng.integers(0, 9, (faces, 3)),
+        rng.integers(0, 255, (9, 3)).astype(np.uint8), double=double, sigma=(rng.random(9), rng.random(9)),
+    )  # fmt: skip
+    PlyData.read(str(tmp_path / "own.ply")).write(str(tmp_path / "plyfile.ply"))
+    assert (tmp_path / "own.ply").read_bytes() == (tmp_path / "plyfile.ply").read_bytes()
 
 
 @pytest.mark.slow

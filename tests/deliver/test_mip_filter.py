@@ -19,7 +19,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.survey.trained_model import TrainedModel
+from pipelines.survey.solution import TrainedModel
 from tests.delivered_scenes import splat_arrays, write_trained
 
 

@@ -18,7 +18,7 @@ from pipelines.core.figures import Headline
 from pipelines.core.products import Remark
 from pipelines.core.sentences import printable
 from pipelines.deliver.options import CESIUM, PageOptions, SplatOptions
-from pipelines.deliver.placement import place
+from pipelines.deliver.placement import solved_placement
 from pipelines.deliver.splat import placed_splat
 from pipelines.deliver.tiles_page import (
     LocalCrs,
@@ -74,7 +74,7 @@ def page_of(survey: Survey, cautions: tuple[Remark, ...] = (), accuracy: Headlin
         logit_opacities=torch.zeros(500),
         sh=torch.zeros(500, 1, 3),
     )
-    splat = placed_splat(gaussians, place(model, survey, means, accuracy), SplatOptions())
+    splat = placed_splat(gaussians, solved_placement(model, survey, means, accuracy), SplatOptions())
     middle_in_geo = splat.placement.file_from_geo.inverse().apply(np.zeros((1, 3)))
     target = target_crs(PageOptions(), survey.origin, middle_in_geo, survey.vertical)
     in_file = splat.gaussians.means.numpy()
@@ -148,8 +148,8 @@ def test_page_says_what_coordinates_and_heights_mean() -> None:
     facts = {fact.name: fact.value for fact in reversed(page_of(surveyed()).facts)}
     assert facts["CRS"] == "EPSG:32632"
     assert facts["Heights"] == "ellipsoidal, as stated; of the survey's input: ellipsoidal, as stated"
-    assert facts["Accuracy"] == "not known: nothing states it yet (georef evaluate)"
-    assert "--crs" in facts["Assumed"]
+    assert facts["Accuracy"] == "not known: nothing states it yet"
+    assert "as nobody stated a CRS" in facts["Assumed"]
 
 
 def evaluated(fit: LocalCrs, enu: np.ndarray) -> np.ndarray:

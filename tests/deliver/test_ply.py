@@ -14,7 +14,7 @@ from pipelines.core.products import Remark, load_json, save_json
 from pipelines.core.stages import GAUSSIANS, MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.deliver.options import ExportPlyOptions
-from pipelines.deliver.placement import Placement, place
+from pipelines.deliver.placement import Placement, solved_placement
 from pipelines.deliver.ply import run
 from pipelines.deliver.splat import placed_splat
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path
@@ -26,8 +26,8 @@ from pipelines.geometry.similarity import Similarity, covariance_at
 from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.reference import render_reference
+from pipelines.survey.solution import TrainedModel
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_model import TrainedModel
 from tests.refusals import refused
 
 OPTIONS = ExportPlyOptions()
@@ -76,7 +76,7 @@ def model(cov: np.ndarray | None = None) -> TrainedModel:
 
 
 def placed(trained: TrainedModel) -> Placement:
-    return place(trained, survey(), gaussians().means.numpy(), None)
+    return solved_placement(trained, survey(), gaussians().means.numpy(), None)
 
 
 @pytest.fixture

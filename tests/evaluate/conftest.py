@@ -18,7 +18,6 @@ from pipelines.core.stages import (
     BY_NAME,
     GAUSSIANS,
     MODEL,
-    SIM3,
     SIM3_POSTERIOR,
     SPARSE,
     SURVEY,
@@ -27,8 +26,8 @@ from pipelines.core.stages import (
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.splat.gaussians import transformed, write_gaussians
+from pipelines.survey.solution import TrainedModel
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_model import TrainedModel
 from tests.scenes import write_workspace
 from tests.splat_scenes import CAMERA, Rendered, make_rendered, write_photographs
 
@@ -37,15 +36,14 @@ def solve(workspace: Workspace) -> None:
     """Write what `init-sim3` finds for the survey, and a trained model that keeps it."""
     survey, sparse = load_json(Survey, workspace.path(SURVEY)), read_sparse(workspace.path(SPARSE))
     points = geolocate(survey, sparse, GeolocateOptions()).points
-    found = estimate_similarity(survey, sparse, points, InitSim3Options())
-    solution, root = found.posterior.solution, workspace.root
-    save_json(found.initial, root / SIM3)
+    posterior, _ = estimate_similarity(survey, sparse, points, InitSim3Options())
+    solution, root = posterior.solution, workspace.root
     save_json(solution, root / ADJUSTMENT)
-    save_posterior(found.posterior, root / SIM3_POSTERIOR)
+    save_posterior(posterior, root / SIM3_POSTERIOR)
     settings = {"max_image_size": CAMERA.width, "background": (0.0, 0.0, 0.0), "sh_degree": 0, "backend": "cpu"}
     model = {**solution.model_dump(), **settings, "iterations": 1, "gaussians": 1}
     save_json(TrainedModel.model_validate(model), root / MODEL)
-    save_posterior(found.posterior, root / TRAIN_POSTERIOR)
+    save_posterior(posterior, root / TRAIN_POSTERIOR)
 
 
 def solved_workspace(root: Path, rendered: Rendered) -> Workspace:

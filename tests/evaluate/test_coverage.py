@@ -20,8 +20,8 @@ def renderer_of(centres: list[tuple[float, float]], points: np.ndarray, turn: np
     poses = [ViewPose(CAMERA, DOWN, np.array([x, y, 10.0])) for x, y in centres]
     poses[-1] = ViewPose(CAMERA, turn, poses[-1].center_in_model)
     split = {"train": list(range(len(centres) - 1)), "test": [len(centres) - 1]}
-    trained = SimpleNamespace(point_in_model=points, indices=split.__getitem__)
-    return SimpleNamespace(trained=trained, pose=poses.__getitem__)
+    model = SimpleNamespace(point_in_model=lambda _sfm: points, indices=split.__getitem__)
+    return SimpleNamespace(model=model, sfm=None, pose=poses.__getitem__)
 
 
 @pytest.fixture

@@ -22,8 +22,8 @@ from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
 from pipelines.evaluate.asprs import few_points
 from pipelines.survey.report import AsprsStatement
+from pipelines.survey.solution import TrainedModel
 from pipelines.survey.survey import KnownDistance, Mark, Survey
-from pipelines.survey.trained_model import TrainedModel
 from tests.evaluate.conftest import solve
 from tests.refusals import codes, numbers, refused, said
 from tests.reports import report_of
@@ -334,7 +334,7 @@ def test_what_needs_gaussians_is_refused_before_training_in_one_sentence(untrain
     weights.touch()
     with refused("not-trained", InputError) as error:
         run_stage(untrained, EVALUATE, {"lpips_weights": weights})
-    assert error.value.field == "--lpips-weights" and "`georef train" in error.value.message
+    assert error.value.field == "--lpips-weights" and "`georef train" in error.value.remedy
 
 
 def test_training_makes_the_evaluation_of_the_cameras_stale(

@@ -16,7 +16,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.report.plots.charts import band_height_px
 from pipelines.splat.gaussians import read_gaussians, write_gaussians
 from pipelines.survey.photographs import render_name
-from pipelines.survey.trained_model import TrainedModel
+from pipelines.survey.solution import TrainedModel
 from tests.reports import report_of
 from tests.splat_scenes import TEST_VIEWS
 

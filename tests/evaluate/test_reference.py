@@ -21,8 +21,8 @@ from pipelines.evaluate.reference_distances import (
     SquareDistances,
     compare_square,
     kinds_of,
-    level_of_detection,
     m3c2_figures,
+    m3c2_level_of_detection,
 )
 from pipelines.geometry.similarity import perturbation
 from pipelines.surface.m3c2 import CONFIDENCE_95, TiledPoints, plane_normals
@@ -120,7 +120,7 @@ def test_offset_is_found_on_ground_roof_and_wall(tmp_path: Path) -> None:
     offset = np.where(normal[:, 0] == 1, -0.06, np.where(roof, 0.02, -0.03))
     tally, _ = compared(tmp_path, model + offset[:, None] * normal, normal, reference, kind)
     cores = tally.cores()
-    lod_m = level_of_detection(cores.noise_m, np.zeros(len(cores.position)))
+    lod_m = m3c2_level_of_detection(cores.noise_m, np.zeros(len(cores.position)))
     groups = {group.name: group for group in tally.groups(cores, lod_m)}
     for name, expected in (("ground", -0.03), ("roof", 0.02), ("wall", -0.06)):
         inner = apart_from_edges(cores, name)
@@ -155,8 +155,10 @@ def test_level_of_detection_covers_noise_and_place(tmp_path: Path) -> None:
         cores = tally.cores()
         level = apart_from_edges(cores, "ground") | apart_from_edges(cores, "roof")
         distance, noise = cores.distance_m[level], cores.noise_m[level]
-        within_noise.append(np.mean(np.abs(distance - off_m) < level_of_detection(noise, np.zeros(len(noise)))))
-        within_all.append(np.mean(np.abs(distance) < level_of_detection(noise, np.full(len(noise), 0.03))))
+        within_noise.append(
+            np.mean(np.abs(distance - off_m) < m3c2_level_of_detection(noise, np.zeros(len(noise))))
+        )
+        within_all.append(np.mean(np.abs(distance) < m3c2_level_of_detection(noise, np.full(len(noise), 0.03))))
     # σ is estimated from 28 points of each cloud: |t| with 54 degrees of freedom is below 1.96 in 94.5 % of places.
     # Cylinders overlap: one place in π is independent, which gives the shares σ of 0.45 % (three runs).
     inside = 1 - 2 * student_t.sf(CONFIDENCE_95, 54)

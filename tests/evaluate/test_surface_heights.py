@@ -14,8 +14,8 @@ from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, REPORT, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.splat.gaussians import read_gaussians, write_gaussians
 from pipelines.survey.report import EvaluationReport
+from pipelines.survey.solution import TrainedModel
 from pipelines.survey.survey import Survey
-from pipelines.survey.trained_model import TrainedModel
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -58,19 +58,27 @@ def _picture(
         first = np.floor(corners.min(axis=0) - half).astype(int)
         last = np.ceil(corners.max(axis=0) + half).astype(int)
         # Areas of pixels by many samples: their places on the tag, exactly
-        at = (np.arange((last - first).max() * _SAMPLES) + 0.5) / _SAMPLES
-        x, y = np.meshgrid(
-            first[0] + at[: (last - first)[0] * _SAMPLES], first[1] + at[: (last - first)[1] * _SAMPLES]
+        width, height = (last - first).tolist()
+        image_from_sample = np.array(
+            [[1, 0, first[0] * _SAMPLES + 0.5], [0, 1, first[1] * _SAMPLES + 0.5], [0, 0, _SAMPLES]]
         )
-        on_tag = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(matrix).T
-        cell = np.floor((on_tag[..., :2] / on_tag[..., 2:] + 1) / 2 * (len(modules) - 2) + 1).astype(int)
-        shown = ((cell >= 0) & (cell < len(modules))).all(axis=-1)
-        cell = np.where(shown[..., None], cell, 0)
-        grey = 30 + 190 * modules[cell[..., 1], cell[..., 0]]
+        inner = (len(modules) - 2) / 2
+        cell_from_tag = np.array([[inner, 0, inner + 1], [0, inner, inner + 1], [0, 0, 1]])
+        to_middle = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # the nearest cell is the one it lies in
+        cell_from_sample = to_middle @ cell_from_tag @ np.linalg.inv(matrix) @ image_from_sample
+        grey = 30 + 190 * modules
+        share, tag = (
+            cv2.warpPerspective(
+                cells,
+                cell_from_sample,
+                (width * _SAMPLES, height * _SAMPLES),
+                flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+            )
+            .reshape(height, _SAMPLES, width, _SAMPLES)
+            .mean(axis=(1, 3))
+            for cells in (np.ones_like(grey), grey)
+        )
         rows, columns = slice(first[1], last[1]), slice(first[0], last[0])
-        blocks = (last - first)[1], _SAMPLES, (last - first)[0], _SAMPLES
-        share = shown.reshape(blocks).mean(axis=(1, 3))
-        tag = np.where(shown, grey, 0).reshape(blocks).mean(axis=(1, 3))
         ground[rows, columns] = ground[rows, columns] * (1 - share) + tag
     blurred = cv2.GaussianBlur(ground, (0, 0), 0.6) + random.normal(0, noise, ground.shape)
     return np.clip(np.rint(blurred), 0, 255).astype(np.uint8), drawn

@@ -69,8 +69,8 @@ def crs_sidecar(crs: str, accuracy: Headline | None, bounds: object = BOUNDS) ->
         "crs": crs, "crs_wkt": parsed.wkt, "vertical_datum": parsed.vertical, "units": parsed.units,
         "operation": "UTM <32>", "operation_accuracy_m": None, "bounds": bounds, "accuracy": accuracy,
         "sigma": SIGMA,
-        "assumed": ("no --crs was given: the UTM zone of the scene",),
-        "cautions": (Remark(code="a", sentence="Half of \x1b /home/me/x.csv is <b>. Give --gcp FILE."),),
+        "assumed": ("the UTM zone of the scene, as nobody stated a CRS",),
+        "cautions": (Remark(code="a", sentence="Half of \x1b /home/me/x.csv is <b>.", remedy="Give --gcp FILE."),),
     })  # fmt: skip
 
 
@@ -138,7 +138,8 @@ def test_values_are_those_of_the_sidecar(tmp_path: Path) -> None:
     assert heights == [BOUNDS[0][2], BOUNDS[1][2]]
     (lineage,) = texts(root, "LI_Lineage/statement")
     assert lineage == (
-        "Coordinates by the operation UTM <32>. Assumed: The UTM zone of the scene. Half of \\x1b x.csv is <b>."
+        "Coordinates by the operation UTM <32>. Assumed: the UTM zone of the scene, as nobody stated a CRS. "
+        "Half of \\x1b x.csv is <b>."
     )
     assert MEASURED.text in texts(root, "abstract")[0]
 

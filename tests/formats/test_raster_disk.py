@@ -13,7 +13,7 @@ from pipelines.formats.geotiff import (
     Band,
     RasterFrame,
     RasterKind,
-    frame_of,
+    raster_frame,
     read_cells,
     read_reduced,
     sampled_raster,
@@ -76,7 +76,12 @@ def test_no_other_file_is_opened(tmp_path: Path, text: str) -> None:
     write_part(other, VALUES, FRAME)
     path = tmp_path / "dsm.tif"
     path.write_text(text.format(other=other))
-    readers = (read_cells, frame_of, lambda file: read_reduced(file, 10), lambda file: sampled_raster(file, PLACE))
+    readers = (
+        read_cells,
+        raster_frame,
+        lambda file: read_reduced(file, 10),
+        lambda file: sampled_raster(file, PLACE),
+    )
     for read in readers:
         with refused("raster-unreadable", InputError) as caught:
             read(path)

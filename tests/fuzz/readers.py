@@ -56,12 +56,12 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.ingest.bag_inspection import inspect_bag
 from pipelines.sfm.foreign_cameras import foreign_file
 from pipelines.surface.measured_cloud import CloudReader
-from pipelines.survey.adjustment import GeolocatedPoints, InitialSimilarity
+from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.calibrated import NavigationTrack
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.report import EvaluationReport
+from pipelines.survey.solution import TrainedModel
 from pipelines.survey.survey import RigCalibration, RigEstimate, Survey
-from pipelines.survey.trained_model import TrainedModel
 from pipelines.train.trainer import load_checkpoint
 from tests import bags, foreign_files, gopro
 from tests.formats.test_surveyors_tables import DEGREES, MRK, POS_HEAD, REFERENCE, SIGMAS, TAIL, XML
@@ -337,8 +337,7 @@ def _read_sidecar(folder: Path) -> None:
 
 def _products(folder: Path) -> None:
     save_json(material(images=4)[2], folder / "Survey.json")
-    save_json(initial(), folder / "InitialSimilarity.json")
-    save_json(trained_model(Similarity()), folder / "TrainedModel.json")
+    save_json(trained_model(Similarity()).model_copy(update={"initial": initial()}), folder / "TrainedModel.json")
     shift = RigEstimate(name="time-offset", unit="s", value=(1,), sigma=(1,), start=(0,), observable=(True,))
     save_json(RigCalibration(applied=(shift,)), folder / "RigCalibration.json")
     report = report_with(triangulated=check_points_with(count=3, rmse_h_m=0.1, rmse_v_m=0.1, rmse_3d_m=0.2))
@@ -346,14 +345,14 @@ def _products(folder: Path) -> None:
 
 
 def _read_products(folder: Path) -> None:
-    for kind in (Survey, InitialSimilarity, TrainedModel, RigCalibration, EvaluationReport):
+    for kind in (Survey, TrainedModel, RigCalibration, EvaluationReport):
         _attempt(lambda kind=kind: _read_product(kind, folder))
 
 
 def _read_product(kind: type[ProductT], folder: Path) -> None:
     product = load_json(kind, folder / f"{kind.__name__}.json")
-    if isinstance(product, InitialSimilarity):
-        Similarity.from_record(product.geo_from_local)
+    if isinstance(product, TrainedModel) and product.initial is not None:
+        Similarity.from_record(product.initial.geo_from_local)
 
 
 def _arrays(folder: Path) -> None:

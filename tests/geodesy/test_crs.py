@@ -195,7 +195,7 @@ def test_what_is_no_crs_is_refused(text: str, code: str) -> None:
 def test_what_is_no_vertical_datum_is_refused(text: str) -> None:
     with refused("vertical-datum-unknown", InputError) as error:
         parse_vertical(text)
-    assert error.value.field == "--vertical" and "ellipsoidal, EGM84, EGM96, EGM2008, EPSG:n" in error.value.message
+    assert error.value.field == "--vertical" and "ellipsoidal, EGM84, EGM96, EGM2008, EPSG:n" in error.value.remedy
 
 
 def test_a_horizontal_crs_is_no_vertical_datum() -> None:

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.geometry.bundle import CorrectionBasis, bundle_information, correction_basis, similarity_modes
+from pipelines.geometry.bundle import bundle_information, similarity_modes
 from pipelines.geometry.network import Network
 from pipelines.geometry.rotations import exp_so3
 from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, jacobian, noisy, pixels, readjusted, size, units
+from tests.dense_bundle import DenseBasis, correction_basis
 from tests.refusals import numbers, refused
 
 
-def basis_of(network: Network, *, lens_follows: bool = True) -> CorrectionBasis:
+def basis_of(network: Network, *, lens_follows: bool = True) -> DenseBasis:
     return correction_basis(bundle_information(network), lens_follows=lens_follows)
 
 

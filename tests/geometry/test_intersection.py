@@ -7,7 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.geometry.intersection import CommonRotation, Rays, UncertainCameras, intersect_rays
+from pipelines.geometry.intersection import (
+    CommonRotation,
+    NearestPoints,
+    Rays,
+    UncertainCameras,
+    intersect_rays,
+    nearest_points,
+)
 from pipelines.geometry.rotations import exp_so3
 from tests.oracles import intersect_one
 from tests.scenes import make_scene
@@ -211,3 +218,46 @@ def test_result_does_not_depend_on_where_chunks_are_cut(monkeypatch: pytest.Monk
     parts = intersect_rays(rays, cameras, len(truth))
     np.testing.assert_allclose(parts.position_in_geo, whole.position_in_geo, atol=1e-9)
     np.testing.assert_array_equal(parts.used, whole.used)
+
+
+def exact_rays(sigma_rad: float, seed: int) -> tuple[NearestPoints, np.ndarray]:
+    """Return the points nearest to rays of exact cameras, with noise of a σ in their directions, and the truth."""
+    cameras, rays, truth = true_cameras(0.1, 0.1, 1e-3)
+    center = cameras.center_in_geo[rays.view]
+    direction = truth[rays.point] - center
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    noise = np.random.default_rng(seed).normal(0.0, sigma_rad, direction.shape)
+    direction = direction + noise - (noise * direction).sum(axis=1, keepdims=True) * direction
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    sigma = np.full(len(direction), max(sigma_rad, 1e-6))
+    return nearest_points(rays.point, center, direction, sigma, len(truth)), truth
+
+
+def test_nearest_points_are_exact_and_their_covariance_is_calibrated() -> None:
+    exact, truth = exact_rays(0.0, 0)
+    np.testing.assert_allclose(exact.position, truth, atol=1e-9)
+    noisy_rays, _ = exact_rays(5e-4, 1)
+    squared = squared_errors(noisy_rays.position, noisy_rays.cov, truth)
+    # 150 points of 3 degrees of freedom: the mean of χ²₃ has a σ of √(6/150) = 0.2.
+    assert abs(squared.mean() - 3.0) < 4 * 0.2
+
+
+def test_derivatives_of_nearest_points_are_those_of_differences() -> None:
+    """The weights are those of the distances, which a small step does not change to first order across the rays."""
+    met, _ = exact_rays(5e-4, 2)
+    by_center, by_direction = met.derivatives()
+    ray, step = 7, 1e-6
+    point = met.point[ray]
+    for axis in np.eye(3):
+        center, direction = met.center.copy(), met.direction.copy()
+        center[ray] += step * axis
+        moved = nearest_points(met.point, center, met.direction, met.sigma_rad, len(met.position)).position
+        np.testing.assert_allclose((moved - met.position)[point] / step, by_center[ray] @ axis, atol=5e-3)
+        turned = direction[ray] + step * axis
+        direction[ray] = turned / np.linalg.norm(turned)
+        tangent = (direction[ray] - met.direction[ray]) / step
+        moved = nearest_points(met.point, met.center, direction, met.sigma_rad, len(met.position)).position
+        scale = np.linalg.norm(met.position[point] - met.center[ray])
+        np.testing.assert_allclose(
+            (moved - met.position)[point] / step, by_direction[ray] @ tangent, atol=5e-3 * scale
+        )

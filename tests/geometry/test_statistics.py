@@ -12,6 +12,7 @@ from pipelines.geometry.statistics import (
     mad_sigma,
     rayleigh_sigma,
     residual_stats,
+    root_information,
     spatial_median,
     squared_mahalanobis,
 )
@@ -40,6 +41,14 @@ def test_mad_sigma_ignores_forty_percent_outliers() -> None:
     assert mad_sigma(values) == pytest.approx(2.0, rel=0.05)
     values[:2000] += 1000.0
     assert mad_sigma(values) < 8.0
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 3])
+def test_root_information_whitens(dimension: int) -> None:
+    factor = np.random.default_rng(dimension).normal(size=(5, dimension, dimension)) * [[[1e-3]]]
+    cov = factor @ np.swapaxes(factor, 1, 2) + 1e-8 * np.eye(dimension)
+    root = root_information(cov)
+    assert root @ cov @ np.swapaxes(root, 1, 2) == pytest.approx(np.tile(np.eye(dimension), (5, 1, 1)), abs=1e-7)
 
 
 def test_squared_mahalanobis_of_correlated_errors() -> None:

@@ -35,10 +35,10 @@ def test_photometric_loss(masked):
     mask = torch.rand(40, 50, generator=random) > 0.3 if masked else None
     values, gradients = [], []
     for device in ("cpu", "cuda"):
-        leaf = rendered.to(device).requires_grad_()
+        leaf = rendered.to(device, copy=True).requires_grad_()
         loss = photometric_loss(leaf, target.to(device), None if mask is None else mask.to(device))
         loss.backward()
-        values.append(float(loss))
+        values.append(loss.item())
         gradients.append(leaf.grad.cpu())
     assert values[1] == pytest.approx(values[0], rel=1e-5)
     assert (gradients[1] - gradients[0]).abs().max() < GRADIENT * gradients[0].abs().max()

@@ -184,7 +184,7 @@ class TestBadMessages:
         assert remarked(survey, "message-unusable", "20 of 65", "/gnss/fix", "no fix (status)")
         assert remarked(survey, "message-unusable", "1 of 65", "/gnss/fix", "altitude is NaN")
         assert remarked(survey, "message-unusable", "latitude or longitude is NaN")
-        assert remarked(survey, "images-without-position", "--max-gap 1 s", "(2)")
+        assert remarked(survey, "images-without-position", "within 1 s", "--max-gap", "(2)")
         fix = survey.images[0].fix
         assert fix is not None and fix.sigma_source == "default"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
-from pipelines.formats.bag_limits import DEFINITIONS
+from pipelines.formats.px4_messages import DEFINITIONS
 from tests import bags
 from tests.bags import Flight, Form
 from tests.ingested_bags import Ingest, check, remarked

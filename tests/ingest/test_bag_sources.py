@@ -13,7 +13,7 @@ import pytest
 from georef_cli import boundary
 from georef_cli.main import cli
 from pipelines.geodesy.enu import lla_from_enu
-from pipelines.ingest.bag_clocks import clock_shifts
+from pipelines.ingest.bag_sources import clock_shifts
 from tests import bags
 from tests.bags import ORIGIN, Flight, Message
 from tests.ingested_bags import Ingest, Refusal, check, remarked

@@ -12,7 +12,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pipelines.formats.bag_limits import DEFINITIONS
+from pipelines.formats.px4_messages import DEFINITIONS
 from tests import bags
 from tests.bags import Flight, Form
 from tests.ingested_bags import Ingest, Refusal, check, remarked

@@ -25,7 +25,7 @@ from pipelines.ingest.stage import survey_and_track
 from pipelines.ingest.survey_assembly import SESSION_GAP_S, fix_sessions
 from pipelines.survey.survey import FixSession, Survey
 from tests.photos import Exif, dji_xmp, gps_entries, jpeg, write_flight
-from tests.refusals import codes, numbers, said
+from tests.refusals import codes, numbers
 
 ELLIPSOIDAL = ("--vertical", "ellipsoidal")
 
@@ -125,7 +125,7 @@ def test_exif_states_kinds_of_receiver(tmp_path: Path) -> None:
     assert survey.sessions == (session("RTK fixed"), session("RTK float"), session("single-frequency"))
     assert [image.fix and image.fix.session for image in survey.images] == [0, 0, 1, 2, None]
     fixed = next(
-        one.sentence
+        one.text
         for one in survey.assumptions
         if one.code == "default-common-sigma" and "(RTK fixed)" in one.sentence
     )
@@ -150,9 +150,10 @@ def test_stated_sigma_and_options_decide_for_a_table(tmp_path: Path) -> None:
     one = ingested(",,", sigma_common_h=0.0)
     assert one.sessions[0].sigma_common_m == (0.0, 0.0, 4.0)
     assert one.sessions[0].sigma_source == "option"
-    sentence = said(one.assumptions, "default-common-sigma")
+    (default,) = (remark for remark in one.assumptions if remark.code == "default-common-sigma")
+    sentence = default.sentence
     assert numbers(sentence) == [4.0, 4.0] and "(unknown receiver)" in sentence
-    assert "--sigma-common-v" in sentence and "--sigma-common-h" not in sentence
+    assert "--sigma-common-v" in default.remedy and "--sigma-common-h" not in default.remedy
     both = ingested(",,", sigma_common_h=0.2, sigma_common_v=0.4)
     assert both.sessions[0].sigma_common_m == (0.2, 0.2, 0.4)
     assert "default-common-sigma" not in codes(both.assumptions)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import cv2
@@ -52,6 +53,10 @@ def test_bits_in_use_fill_eight(tmp_path: Path, bits: int, suffix: str) -> None:
     pictures = [large, *(np.kron(picture, np.ones((4, 4), np.uint16)) for picture in pictures[1:])]
     survey, found = _survey(tmp_path, pictures, suffix)
     assert f"{bits} bits" in said(survey.assumptions, "image-bit-depth")
+    assert survey.original_dir == str((tmp_path / "photos").resolve())
+    assert {each.name: each.sha256 for each in survey.originals} == {
+        file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in (tmp_path / "photos").iterdir()
+    }
     for number, picture in enumerate(found):
         expected = _scene(number) * 255
         # Rounded to 2^bits − 1 steps, cut off below, and to 255 steps.
@@ -78,4 +83,5 @@ def test_sixteen_and_eight_bits_stay_as_they_are(tmp_path: Path) -> None:
     pictures = [(_scene(number) * 65535).astype(np.uint16) for number in range(COUNT)]
     survey, _ = _survey(tmp_path, pictures, ".png")
     assert survey.image_dir == str((tmp_path / "photos").resolve())
+    assert survey.original_dir is None and not survey.originals
     assert "image-bit-depth" not in codes(survey.assumptions)

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image, ImageOps
 
 from pipelines.core.errors import InputError
+from pipelines.ingest.ground_points import stored_pixel
 from pipelines.ingest.options import IngestOptions
-from pipelines.ingest.shown_marks import stored_pixel
 from pipelines.ingest.stage import survey_and_track
 from pipelines.survey.survey import Survey
 from tests.photos import SHORT, Exif, gps_entries, jpeg

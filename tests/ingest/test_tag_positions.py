@@ -247,6 +247,21 @@ def test_a_gimbal_beside_the_track_is_corrected_by_the_aircraft(offset: float) -
     assert abs(offset - 1.0) == pytest.approx(numbers(said(remarks.cautions, "headings-apart"))[1], abs=1.0)
 
 
+@pytest.mark.parametrize(
+    ("turned", "pitch", "roll"), [(180.0, -90.0, 180.0), (179.1, -85.6, 179.1), (-130.0, -89.7, 130.0)]
+)
+def test_yaw_and_roll_of_a_gimbal_at_nadir_count_together(turned: float, pitch: float, roll: float) -> None:
+    """At pitch −90° a roll turns the image as the same yaw does: no heading disagrees, nothing is turned."""
+    drone = [
+        DjiTags(gimbal_yaw_pitch_roll_deg=(float(yaw) + turned, pitch, roll), flight_yaw_deg=float(yaw))
+        for yaw in TRACK
+    ]
+    poses, remarks = read(photos(gps=gps(*LINES), dji=drone))
+    expected = geo_from_cam([(yaw + turned, pitch, roll) for yaw in TRACK])
+    np.testing.assert_allclose(poses.enu_from_cam, expected, atol=1e-12)
+    assert np.isnan(poses.sigma_attitude_deg).all() and not remarks.cautions
+
+
 def test_where_the_track_tells_nothing_sigma_covers_both() -> None:
     poses, remarks = read(photos(gps=gps(*LINES), dji=headings(TRACK * 0 + 140.0, TRACK * 0 + 90.0)))
     np.testing.assert_allclose(poses.sigma_attitude_deg, 50.0)

@@ -119,7 +119,7 @@ class TestCluster:
             job("larger than any worker", gib=99.0),
             job("done", "send('log', name='x', level=30, text='look out'); advance(1, ''); send('end')"),
         )
-        assert {name: (end.code, end.place) for name, end in ends.items()} == {
+        assert {name: (end.code, end.step) for name, end in ends.items()} == {
             "crash": (-signal.SIGABRT, "train"),
             "input": (1, "train"),
             "larger than any worker": (0, "train"),

@@ -35,4 +35,4 @@ def test_inner_tasks_are_the_note_of_the_line() -> None:
         ("north of 8", 0, "train · training 600/900 · 20.1 dB", math.inf),
         ("north of 8", 1, "train", math.inf),
     ]
-    assert line.place == "train"
+    assert line.step == "train"

@@ -62,7 +62,7 @@ def test_each_end_is_told_and_none_stops_another() -> None:
         job("defect", code=MESSAGES + "{}['key']"),
         job("done", code=MESSAGES + "send('advance', steps=1, note='', left_s=None); send('end')"),
     )
-    assert {name: (end.is_done, end.place) for name, end in ends.items()} == {
+    assert {name: (end.is_done, end.step) for name, end in ends.items()} == {
         "killed": (False, "sfm"),
         "failed": (False, "sfm"),
         "defect": (False, "sfm"),

@@ -91,7 +91,9 @@ def test_the_lists_that_are_shown_are_lists(tmp_path: Path) -> None:
     lists = [load_missions(written(tmp_path, text), OWNERS) for text in shown]
     assert [mission.name for listed in lists for mission in listed.missions] == ["north", "south"]
     example = load_missions(REPOSITORY / "examples/batch/missions.toml", OWNERS)
-    assert [mission.place for mission in example.missions] == [f"workspace/{m.name}" for m in example.missions]
+    assert [mission.relative_path for mission in example.missions] == [
+        f"workspace/{m.name}" for m in example.missions
+    ]
 
 
 def test_a_folder_of_mission_folders(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import pytest
 
 from pipelines.core.stages import DELIVERABLES, PIPELINE
 from pipelines.jobs import pace
+from pipelines.jobs.costs import COSTS, Work
 
 
 @pytest.fixture(autouse=True)
@@ -18,8 +19,8 @@ def test_every_stage_and_deliverable_has_a_time() -> None:
     own = {"sfm", "train"}  # which have models of their own
     for spec in (*PIPELINE, *DELIVERABLES):
         if spec.name not in own:
-            few, many = pace.modelled_s(spec.name, 10, 2.0), pace.modelled_s(spec.name, 400, 80.0)
-            assert few is not None and many is not None and 0 < few <= many
+            few, many = (COSTS[spec.name].of(Work(photographs=count, megapixels=count / 5)) for count in (10, 400))
+            assert 0 < few <= many
 
 
 def test_the_median_of_the_last_runs_corrects_the_next() -> None:

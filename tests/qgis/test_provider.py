@@ -187,7 +187,7 @@ def test_change_arrives_styled(done: dict[str, Any], survey: Path) -> None:
     layers = layers_of(done["change"])
     ramp = [float(text) for text in layers["Later minus earlier height"]["legend"]]
     assert ramp[0] == -ramp[-1] and 0.0 in ramp  # white at no change
-    assert layers["Significant change"]["legend"] == ["no significant change", "lowered", "raised"]
+    assert layers["Significant change"]["legend"] == ["no significant change", "lowered", "raised", "doubtful"]
     assert layers["Regions of change"]["legend"] == ["raised", "lowered"]
     assert layers["Regions of change"]["features"] == 2
 

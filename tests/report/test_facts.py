@@ -15,20 +15,20 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import SURVEY
-from pipelines.geometry.bundle import correction_basis
 from pipelines.report.accuracy import ninety_percent
 from pipelines.report.cameras import bias_of, cameras_facts, lenses_facts, mean_by_region
 from pipelines.report.cover import cover_facts, days_of, flying_height_m
 from pipelines.report.options import ReportOptions
 from pipelines.report.place import links_of, overlap_facts, ties_of
 from pipelines.report.points import cut_chips, points_facts
-from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, level_of, verdicts
+from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, verdict_of, verdicts
 from pipelines.report.views import read_metrics
 from pipelines.survey.area import ground_sampling_m, photographs_that_see
 from pipelines.survey.report import ByAxis, DistanceError, PointError, PredictedSigma, SurfaceHeight
 from pipelines.survey.report_parts import VarianceFactor
+from pipelines.survey.solution import fix_differences
 from pipelines.survey.survey import LOCAL_FRAME, Survey
-from pipelines.survey.trained_survey import fix_differences
+from tests.dense_bundle import correction_basis, lens_elimination
 from tests.evaluated_workspaces import CHECK_POINTS, ERROR_M
 from tests.refusals import refused
 from tests.report.conftest import Reported
@@ -40,14 +40,14 @@ def test_photographs_that_see_a_point_are_those_that_observe_it(reported: Report
     scene = reported.truth.scene
     owner, _, _ = scene.pixels(scene.point_in_geo)
     true_count = np.bincount(owner, minlength=len(scene.point_in_geo))
-    seen = photographs_that_see(reported.survey.solved, scene.point_in_geo)
+    seen = photographs_that_see(reported.solution, reported.sfm, scene.point_in_geo)
     # The scene leaves out rays beyond a slope of 0.8, which the corners of the frame reach.
     assert (seen >= true_count).all()
     assert (seen == true_count).mean() > 0.95
 
 
 def test_links_count_the_points_that_two_photographs_share(reported: Reported) -> None:
-    network = reported.survey.network
+    network = reported.network
     points = [set(network.obs_point[network.obs_image == image]) for image in range(len(network.camera_id))]
     expected = {(i, j): len(points[i] & points[j]) for i, j in combinations(range(len(points)), 2)}
     pairs, shared = links_of(network)
@@ -64,7 +64,7 @@ def test_photographs_without_a_tie_form_groups_of_their_own() -> None:
 
 
 def test_reprojection_residuals_are_the_noise_of_the_pixels(reported: Reported) -> None:
-    facts = lenses_facts(reported.survey)
+    facts = lenses_facts(reported.survey, reported.posterior, reported.network)
     # The cameras are true, and each point is adjusted to its rays: 3 of 2 r parameters are fitted.
     observations, points = facts.observations, facts.points
     expected = NOISE.pixel_px * np.sqrt(2 - 3 * points / observations)
@@ -89,9 +89,9 @@ def test_mean_residuals_by_region_show_a_planted_pattern() -> None:
 
 
 def test_lens_covariance_lies_between_its_free_part_and_that_of_the_photographs(reported: Reported) -> None:
-    covariance = reported.survey.posterior.of_lens()
-    bundle = scene_of(reported.survey.solved.model, reported.survey.solved.sfm).bundle
-    by_poses, alone = correction_basis(bundle).lens_matrix, np.linalg.inv(bundle.lens_elimination[1])
+    covariance = reported.posterior.of_lens()
+    bundle = scene_of(reported.solution, reported.sfm).bundle
+    by_poses, alone = correction_basis(bundle).lens_matrix, np.linalg.inv(lens_elimination(bundle)[1])
     assert covariance is not None
     from_photographs = by_poses @ by_poses.T + alone
     scale = 1 / np.sqrt(np.diag(from_photographs))
@@ -108,7 +108,7 @@ def test_lens_covariance_lies_between_its_free_part_and_that_of_the_photographs(
 def test_fix_differences_are_the_errors_of_the_fixes(reported: Reported) -> None:
     survey = load_json(Survey, reported.truth.workspace.path(SURVEY))
     fixes = np.array([image.fix.position_in_geo for image in survey.images if image.fix is not None])
-    found = fix_differences(reported.survey.solved)
+    found = fix_differences(reported.solution, reported.survey)
     np.testing.assert_allclose(found.difference_in_geo, reported.truth.scene.center_in_geo - fixes, atol=1e-6)
     used = found.difference_in_geo  # also of the test view
     stated_m = np.sort(np.abs(used), axis=0)[[3]] * np.ones((len(used), 1))
@@ -122,7 +122,7 @@ def test_fix_differences_are_the_errors_of_the_fixes(reported: Reported) -> None
 
 
 def test_photographs_have_coordinates_and_differences(reported: Reported) -> None:
-    facts = cameras_facts(reported.survey)
+    facts = cameras_facts(reported.survey, reported.posterior, reported.crs)
     assert [row.use for row in facts.rows].count("test") == 1
     assert facts.by_time
     assert all(row.measured is not None and row.difference_m is not None for row in facts.rows)
@@ -132,9 +132,17 @@ def test_photographs_have_coordinates_and_differences(reported: Reported) -> Non
 
 
 def test_chips_show_the_mark_and_where_the_points_project(reported: Reported) -> None:
-    control, check = points_facts(reported.survey, 2, SILENT)
+    control, check = points_facts(
+        reported.truth.workspace,
+        reported.survey,
+        reported.posterior,
+        reported.report,
+        reported.crs,
+        chips_a_point=2,
+        progress=SILENT,
+    )
     assert (len(control.rows), len(check.rows)) == (3, CHECK_POINTS)
-    scene, survey = reported.truth.scene, reported.survey.solved.survey
+    scene, survey = reported.truth.scene, reported.survey
     for row, point in zip(check.rows, survey.check_points, strict=True):
         assert row.field is not None
         assert len(row.chips) == 2
@@ -162,7 +170,7 @@ def _decoded(address: str) -> np.ndarray:
 
 
 def test_no_chips_are_cut_when_none_are_wanted(reported: Reported) -> None:
-    chips, side_px = cut_chips(reported.survey, [], SILENT)
+    chips, side_px = cut_chips(reported.truth.workspace, reported.survey, reported.posterior.sparse, [], SILENT)
     assert (chips, side_px) == ({}, 96)
 
 
@@ -280,14 +288,14 @@ def test_a_sigma_that_the_table_calls_too_large_is_not_good(source: str, level: 
 
 
 def test_the_largest_residual_of_a_fix_is_that_of_its_axis(reported: Reported) -> None:
-    facts, evaluated = cameras_facts(reported.survey), reported.survey
-    fixes = fix_differences(evaluated.solved)
+    facts, survey = cameras_facts(reported.survey, reported.posterior, reported.crs), reported.survey
+    fixes = fix_differences(reported.solution, survey)
     stated = {
         image.name: np.sqrt(np.diag(np.array(image.fix.cov_apart)))
-        for image in evaluated.solved.survey.images
+        for image in survey.images
         if image.fix is not None
     }
-    names = evaluated.solved.sparse.image_name
+    names = reported.sfm.image_name
     ratios = {
         names[camera]: float((np.abs(row) / stated[names[camera]]).max())
         for camera, row, out in zip(fixes.camera, fixes.difference_in_geo, fixes.is_outlier, strict=True)
@@ -329,16 +337,29 @@ def test_verdicts_are_given_on_what_there_is() -> None:
 
 
 def test_facts_of_the_cover_are_those_of_the_flight(reported: Reported) -> None:
-    scene, survey = reported.truth.scene, reported.survey
+    scene, solution, points = reported.truth.scene, reported.solution, reported.scene_in_geo
     above_m = scene.center_in_geo[:, 2].mean() - np.median(scene.point_in_geo[:, 2])
-    height_m, gsd_m = flying_height_m(survey), ground_sampling_m(survey.solved)
+    height_m = flying_height_m(solution.center_in_geo, points)
+    gsd_m = ground_sampling_m(solution, reported.sfm)
     assert height_m is not None and gsd_m is not None
     assert height_m == pytest.approx(above_m, abs=float(np.ptp(scene.point_in_geo[:, 2])))
     owner, image, _ = scene.pixels(scene.point_in_geo)
     away = np.linalg.norm(scene.point_in_geo[owner] - scene.center_in_geo[image], axis=1)
     # Depth is shorter than distance, by the cosine of at most half the frame's diagonal.
     assert 0.7 * np.median(away) < gsd_m * scene.camera.mean_focal_px <= np.median(away)
-    facts = dict(cover_facts(survey, overlap_facts(survey), lenses_facts(survey), ReportOptions()).facts)
+    network, crs, posterior = reported.network, reported.crs, reported.posterior
+    cover = cover_facts(
+        reported.truth.workspace,
+        reported.survey,
+        posterior,
+        reported.report,
+        ReportOptions(),
+        crs=crs,
+        scene=points,
+        overlap=overlap_facts(posterior, network, points, crs),
+        lenses=lenses_facts(reported.survey, posterior, network),
+    )
+    facts = dict(cover.facts)
     assert facts["Photographs"] == "8 of 8 registered"
     assert facts["Surveyed points"] == f"3 control points, {CHECK_POINTS} check points"
     assert facts["Photographs of a place"] == "8 (median)"
@@ -359,8 +380,8 @@ def test_days_of_the_photographs(times_s: tuple[float | None, ...], days: str) -
 
 
 def test_limits_belong_to_the_better_verdict() -> None:
-    assert level_of(REGISTERED[0], REGISTERED, more_is_better=True) == "good"
-    assert level_of(FIX_OUTLIERS[1], FIX_OUTLIERS, more_is_better=False) == "fair"
+    assert verdict_of(REGISTERED[0], REGISTERED, more_is_better=True) == "good"
+    assert verdict_of(FIX_OUTLIERS[1], FIX_OUTLIERS, more_is_better=False) == "fair"
 
 
 @pytest.mark.parametrize("line", ["[]", "{}", '{"iteration": "x"}', '{"iteration": 1, "psnr": [1]}', "no json }"])
@@ -379,7 +400,7 @@ def test_unfinished_last_line_of_the_metrics_is_left_out(tmp_path: Path) -> None
 
 
 def test_map_of_the_overlap_covers_the_scene(reported: Reported) -> None:
-    facts = overlap_facts(reported.survey)
+    facts = overlap_facts(reported.posterior, reported.network, reported.scene_in_geo, reported.crs)
     assert facts.median == 8  # the orbit's eight photographs all look at its middle
     assert facts.parts == 1
     assert facts.enough_share is not None

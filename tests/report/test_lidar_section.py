@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.core.figures import DEPTH_ERRORS
 from pipelines.core.products import Remark, save_json
 from pipelines.core.stages import LIDAR, LIDAR_MAP
 from pipelines.core.workspace import Workspace
 from pipelines.report.page import Page, Section, render_page
 from pipelines.report.plots.maps import DrawnArea, write_lidar_map
 from pipelines.report.record import lidar_facts
-from pipelines.survey.report_parts import LidarArea, LidarRegistration, LidarReport
+from pipelines.survey.report_parts import DepthErrors, HeldOutDepths, LidarArea, LidarRegistration, LidarReport
 
 
 def area(kind: str, area_m2: float) -> LidarArea:
@@ -55,3 +56,21 @@ def test_the_page_says_what_the_training_has_recorded(tmp_path: Path) -> None:
     ):  # fmt: skip
         assert words in text
     assert html.count("data:image/png") + html.count("data:image/webp") + html.count("data:image/jpeg") >= 1
+
+
+def test_errors_at_held_out_points_stand_on_the_page(tmp_path: Path) -> None:
+    """Figures of the report's document, under the words of the one table of figures."""
+    (tmp_path / "train").mkdir()
+    save_json(REPORT_OF_TRAINING, tmp_path / LIDAR)
+    before = DepthErrors(points=812, bias_m=-0.031, median_m=0.062, abs_90_m=0.4)
+    after = DepthErrors(points=812, bias_m=0.002, median_m=0.021, abs_90_m=0.1)
+    found = HeldOutDepths(
+        share=0.05, points=900, changed=3, unseen=40, known_before=830, known_after=880, before=before, after=after
+    )
+    facts, document = lidar_facts(Workspace(tmp_path)), {"held_out": found.model_dump()}
+    html = render_page(
+        Page("", "", {}, (Section("lidar", "LiDAR", "lidar.html", facts),), document), "pipelines.report"
+    )
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", html))
+    assert all(figure.label in text for figure in DEPTH_ERRORS.values())
+    assert "before 812 −0.031 0.062 0.400" in text and "after 812 +0.002 0.021 0.100" in text

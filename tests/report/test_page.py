@@ -6,7 +6,7 @@ import base64
 import html
 import json
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -130,7 +130,7 @@ def test_paper_lacks_no_number_of_a_section(reported: Reported) -> None:
 def test_sentences_on_maps_and_positions_are_true(reported: Reported) -> None:
     """Axes are those of the CRS, and the residuals are those of test views as well."""
     assert "count from the survey's origin" not in reported.html
-    solved = [camera.split for camera in reported.survey.solved.model.cameras]
+    solved = [camera.split for camera in reported.solution.cameras]
     assert "with measured and predicted accuracy" in reported.html
     assert "test" in solved and "positions of training photographs" not in reported.html
 
@@ -232,11 +232,19 @@ def test_without_evaluation_the_command_is_named(tmp_path: Path) -> None:
 
 
 def test_photograph_that_changed_is_refused(reported: Reported) -> None:
-    trained = reported.survey.solved
-    images = tuple(image.model_copy(update={"sha256": "0" * 64}) for image in trained.survey.images)
-    changed = replace(trained, survey=trained.survey.model_copy(update={"images": images}))
+    survey = reported.survey
+    images = tuple(image.model_copy(update={"sha256": "0" * 64}) for image in survey.images)
+    changed = survey.model_copy(update={"images": images})
     with refused("photograph-changed", InputError):
-        points_facts(replace(reported.survey, solved=changed), 1, SILENT)
+        points_facts(
+            reported.truth.workspace,
+            changed,
+            reported.posterior,
+            reported.report,
+            reported.crs,
+            chips_a_point=1,
+            progress=SILENT,
+        )
 
 
 def test_pdf_without_chromium_is_refused_before_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

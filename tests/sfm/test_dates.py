@@ -17,11 +17,11 @@ from pipelines.adjust.posterior import save_posterior
 from pipelines.core.errors import DegenerateGeometryError, InputError, MissingProductError
 from pipelines.core.products import save_json
 from pipelines.core.progress import SILENT
-from pipelines.core.stages import ADJUSTMENT, SIM3, SIM3_POSTERIOR
+from pipelines.core.stages import ADJUSTMENT, SIM3_POSTERIOR
 from pipelines.formats.colmap import quiet_colmap, reconstruction_of
 from pipelines.geodesy.enu import Origin
 from pipelines.sfm.colmap_database import write_frame
-from pipelines.sfm.dates import DATABASE, EarlierDate, pairs_across, tie_to_earlier
+from pipelines.sfm.dates import DATABASE, SolvedDate, pairs_across, tie_to_earlier
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.common_points import CommonPoints
@@ -60,9 +60,8 @@ def write_features(date: Date, path: Path, looks: np.ndarray, seed: int) -> None
 def earlier_workspace(root: Path, origin: Origin = HERE) -> Date:
     date = draw_date(0, np.random.default_rng(0), origin=origin)
     workspace = write_workspace(root, date.survey, date.model)
-    save_json(date.estimated.initial, root / SIM3)
-    save_json(date.estimated.posterior.solution, root / ADJUSTMENT)
-    save_posterior(date.estimated.posterior, root / SIM3_POSTERIOR)
+    save_json(date.posterior.solution, root / ADJUSTMENT)
+    save_posterior(date.posterior, root / SIM3_POSTERIOR)
     write_features(date, workspace.root / DATABASE, LOOKS, 1)
     return date
 
@@ -73,7 +72,7 @@ def tied(root: Path, later: Date, looks: np.ndarray = LOOKS) -> CommonPoints:
     write_features(later, job.database, looks, 2)
     with quiet_colmap() as colmap:
         found = tie_to_earlier(
-            colmap, job, reconstruction_of(later.model), EarlierDate.load(root / "spring", later.survey), SILENT
+            colmap, job, reconstruction_of(later.model), SolvedDate.load(root / "spring", later.survey), SILENT
         )
     assert sorted(path.name for path in job.database.parent.iterdir()) == ["database.db"]
     return found
@@ -120,7 +119,7 @@ def test_another_place_is_refused_before_the_work(tmp_path: Path) -> None:
     later = draw_date(1, np.random.default_rng(1)).survey
     moved = later.model_copy(update={"origin": Origin(lat_deg=46.03, lon_deg=7.75, alt_m=1600.0)})
     with pytest.raises(InputError) as refused:
-        EarlierDate.load(tmp_path / "spring", moved)
+        SolvedDate.load(tmp_path / "spring", moved)
     assert refused.value.code == "earlier-apart"
     assert "3" in str(refused.value)  # three kilometres
 
@@ -148,7 +147,7 @@ def test_what_cannot_be_tied_is_refused(
 ) -> None:
     survey = spoiled(tmp_path / "spring", earlier_workspace(tmp_path / "spring").survey)
     with pytest.raises(InputError if code else MissingProductError) as refused:
-        EarlierDate.load(tmp_path / "spring", survey)
+        SolvedDate.load(tmp_path / "spring", survey)
     if code:
         assert refused.value.code == code  # type: ignore[union-attr]
 
@@ -160,7 +159,7 @@ def test_photographs_of_a_large_survey_are_paired_with_those_beside_them(
     monkeypatch.setattr("pipelines.sfm.dates._NEIGHBOURS", 2)
     earlier_workspace(tmp_path / "spring")
     later = draw_date(1, np.random.default_rng(1))
-    date = EarlierDate.load(tmp_path / "spring", later.survey)
+    date = SolvedDate.load(tmp_path / "spring", later.survey)
     model: Any = reconstruction_of(later.model)
     pairs = pairs_across(later.survey, model, date)
     assert {image_id for image_id, _ in pairs} == set(range(1, IMAGES + 1))

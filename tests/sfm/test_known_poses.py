@@ -20,6 +20,7 @@ from tests.refusals import refused
 from tests.sfm_scenes import CONFIG
 
 pytest.importorskip("pycolmap")
+pytestmark = pytest.mark.usefixtures("children_here")
 
 
 def poses_alone(model: SparseModel, folder: Path) -> Path:

@@ -18,10 +18,10 @@ from pipelines.geometry.rotations import geo_from_cam
 from pipelines.geometry.similarity import umeyama
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.ingest.options import IngestOptions
+from pipelines.ingest.readout_times import with_readouts, with_velocities
 from pipelines.ingest.remarks import Remarks
-from pipelines.ingest.rolling_shutter import with_readouts, with_velocities
 from pipelines.sfm.adjustment import adjust_finally
-from pipelines.sfm.rolling_shutter import correct_tie_points
+from pipelines.sfm.global_shutter_points import correct_tie_points
 from pipelines.simulate.lens import BrownLens, Pose
 from pipelines.survey.marks import bearings_at
 from pipelines.survey.photographs import ImageCache, Photograph

@@ -63,7 +63,7 @@ def test_colmap_opens_the_model_and_the_database(mapped: Workspace) -> None:
 
 
 def test_continues_the_database_of_an_interrupted_run(
-    mapped: Workspace, photographs: Photographs, tmp_path: Path
+    mapped: Workspace, photographs: Photographs, tmp_path: Path, children_here: None
 ) -> None:
     out = tmp_path / "sfm.partial"
     out.mkdir()
@@ -111,7 +111,7 @@ def test_current_while_photographs_and_places_are_the_same(mapped: Workspace, tm
     assert status(workspace)[1].state == "stale"
 
 
-def test_import_takes_over_a_model(mapped: Workspace, tmp_path: Path) -> None:
+def test_import_takes_over_a_model(mapped: Workspace, tmp_path: Path, children_here: None) -> None:
     out = tmp_path / "sfm.partial"
     out.mkdir()
     summary = run(StageRun(mapped, out), SfmOptions(import_model=mapped.path(SPARSE)))

@@ -30,3 +30,7 @@ def test_finite_values_pass_and_a_reset_forgets() -> None:
     monitor.note(2, scalars(float("nan"), 0))
     monitor.reset()
     monitor.check()
+    monitor.note(3, scalars(0, float("inf")))
+    with pytest.raises(NonFiniteError) as caught:
+        monitor.check()
+    assert (caught.value.name, caught.value.iteration) == ("b", 3)

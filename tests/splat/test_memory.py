@@ -14,6 +14,7 @@ from pipelines.core.errors import ResourceError
 from pipelines.core.machine import _free_in_group
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.memory import (
+    USABLE,
     TrainingSize,
     free_memory_bytes,
     predicted_peak_bytes,
@@ -84,9 +85,12 @@ def test_too_large_an_image_cannot_be_saved_by_fewer_gaussians() -> None:
     assert "a smaller --max-image-size and a smaller --max-gaussians" in str(caught.value)
 
 
-def test_what_fits_or_cannot_be_known_is_not_refused() -> None:
-    require_memory(SIZE, 2 * predicted_peak_bytes(SIZE))
+def test_a_training_is_refused_from_nine_tenths_of_the_free_memory_on_and_never_where_it_is_unknown() -> None:
+    needed = predicted_peak_bytes(SIZE)
     require_memory(SIZE, None)
+    require_memory(SIZE, int(1.001 * needed / USABLE))
+    with refused("training-memory", ResourceError):
+        require_memory(SIZE, int(0.999 * needed / USABLE))
 
 
 def test_the_machine_tells_how_much_is_free() -> None:

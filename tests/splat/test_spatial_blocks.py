@@ -44,7 +44,7 @@ def test_chosen_gaussians_hold_all_that_a_window_shows(seed: int) -> None:
     matrix = torch.as_tensor(pose, dtype=torch.float32)
     for window in (Window(0, 0, 3, 3), Window(80, 60, 5, 4), Window(157, 118, 3, 2), None):
         settings = RasterSettings(sh_degree=1, depth=True, window=window)
-        chosen = blocks.shown(pose, CAMERA, settings)
+        chosen = blocks.in_view(pose, CAMERA, settings)
         visible = backend.render(gaussians, matrix, CAMERA, settings).stats.visible
         among_chosen = (gaussians.means[visible][:, None] == chosen.means).all(dim=2).any(dim=1)
         assert among_chosen.all()
@@ -53,11 +53,11 @@ def test_chosen_gaussians_hold_all_that_a_window_shows(seed: int) -> None:
 def test_few_of_many_are_chosen_where_gaussians_are_small() -> None:
     gaussians = scattered(100_000, 9)
     gaussians = replace(gaussians, log_scales=gaussians.log_scales.clamp(max=-4.0))
-    chosen = SpatialBlocks(gaussians).shown(np.eye(4), CAMERA, RasterSettings(window=Window(80, 60, 3, 3)))
+    chosen = SpatialBlocks(gaussians).in_view(np.eye(4), CAMERA, RasterSettings(window=Window(80, 60, 3, 3)))
     # The 782 blocks fill a volume: each is a tenth of it wide, and the line of sight meets some tens of them.
     assert 0 < len(chosen) < 0.15 * len(gaussians)
 
 
 def test_no_gaussians() -> None:
     blocks = SpatialBlocks(scattered(0, 0))
-    assert len(blocks.shown(np.eye(4), CAMERA, RasterSettings())) == 0
+    assert len(blocks.in_view(np.eye(4), CAMERA, RasterSettings())) == 0

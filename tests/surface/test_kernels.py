@@ -171,5 +171,7 @@ def test_the_winner_is_the_largest_score_with_the_scores_around_it(seed: int, co
 
 def test_depth_maps_load_without_opencvs_contributed_modules() -> None:
     """A machine without them can train on depth maps that exist."""
-    code = "import cv2; vars(cv2).pop('ximgproc', None); import pipelines.surface.depth_maps"
-    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": str(REPOSITORY)})
+    code = "import cv2; vars(cv2).pop('ximgproc', None); import pipelines.surface.depth_maps as m; print(m)"
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment)
+    assert "depth_maps.py" in done.stdout

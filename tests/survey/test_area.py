@@ -17,10 +17,12 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import Origin, lla_from_enu
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.area import Area, boundary_area, scene_in_geo, seen_area
 from pipelines.survey.options import BOUNDARY_SUFFIXES, AreaOptions, CrsOptions
+from pipelines.survey.solution import Solution
+from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import target_crs
-from pipelines.survey.trained_survey import SolvedSurvey
 from tests.refusals import refused
 from tests.scenes import (
     NOISELESS,
@@ -109,8 +111,8 @@ def test_a_boundary_states_a_crs_and_lies_at_the_survey(tmp_path: Path) -> None:
         boundary_area(AreaOptions(boundary=written(tmp_path, ".gpkg")), np.add(POINTS, [500, 0, 0]), ORIGIN)
 
 
-def solved(centers: np.ndarray) -> SolvedSurvey:
-    """Return a survey of level ground that looks straight down, with a pixel of the same size everywhere."""
+def solved(centers: np.ndarray) -> tuple[Solution, SparseModel, Survey]:
+    """Return a solved survey of level ground that looks straight down, with a pixel of the same size everywhere."""
     rng = np.random.default_rng(1)
     scene = TrueScene(
         centers,
@@ -122,7 +124,7 @@ def solved(centers: np.ndarray) -> SolvedSurvey:
     sparse = sparse_model(scene, NOISELESS, rng)
     poses = CameraPoses(sparse.rotation_cam_from_local, centers)
     model = trained_model(Similarity(), cameras=trained_cameras(scene.names, poses))
-    return SolvedSurvey(survey_of(scene, NOISELESS, Measured(), rng), sparse, model)
+    return model, sparse, survey_of(scene, NOISELESS, Measured(), rng)
 
 
 def test_default_is_the_ground_that_three_photographs_see() -> None:
@@ -131,24 +133,23 @@ def test_default_is_the_ground_that_three_photographs_see() -> None:
     A frame is 1200 × 900 px at a focal length of 1020: 47 × 35 m. The smoothing may round the corners.
     """
     centers = np.array([(east, 0.0, 40.0) for east in (-24, -12, 0, 12, 24)])
-    survey = solved(centers)
-    area = seen_area(survey, scene_in_geo(survey))
+    solution, sfm, survey = solved(centers)
+    area = seen_area(solution, sfm, scene_in_geo(solution, sfm))
     half = 40 * 600 / 1020, 40 * 450 / 1020
     expected = shapely.box(-half[0], -half[1], half[0], half[1])
     common = area.polygon.intersection(expected).area / area.polygon.union(expected).area
     assert area.polygon.geom_type == "Polygon"
     assert not area.polygon.interiors
     assert common > 0.9
-    survey = solved(centers).survey
     target = target_crs(CrsOptions(crs=UTM), survey.origin, POINTS, survey.vertical)
     # UTM's scale is 0.9997 here, and the survey lies 250 ppm above the ellipsoid.
     assert area.in_crs(target).area == pytest.approx(area.polygon.area, rel=1.5e-3)
 
 
 def test_two_photographs_have_no_area() -> None:
-    survey = solved(np.array([(0.0, 0.0, 40.0), (5.0, 0.0, 40.0)]))
+    solution, sfm, _ = solved(np.array([(0.0, 0.0, 40.0), (5.0, 0.0, 40.0)]))
     with refused("no-common-ground", DegenerateGeometryError):
-        seen_area(survey, scene_in_geo(survey))
+        seen_area(solution, sfm, scene_in_geo(solution, sfm))
 
 
 def test_an_area_without_extent_contains_nothing() -> None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
 from pipelines.geometry.cameras import CameraPoses, Pinhole
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.splat.initialise import gaussians_of_size
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.surface.picking import DepthMap, points_on_surface
-from pipelines.survey.marks import MarkRays, mark_rays
-from pipelines.survey.survey import SurveyedPoint
-from pipelines.survey.trained_survey import TrainedSurvey, triangulated_points
+from pipelines.survey.marks import MarkRays, mark_rays, triangulated_points
+from pipelines.survey.solution import Solution
+from pipelines.survey.survey import Survey, SurveyedPoint
 from tests.scenes import (
     GEO_FROM_LOCAL,
     Measured,
@@ -31,34 +33,38 @@ MODEL_FROM_GEO = Similarity(1.0, exp_so3([0.01, 0.02, -0.03]), np.array([-10.0, 
 PINHOLE = Pinhole(320, 240, 270.0, 270.0, 160.0, 120.0)
 
 
+class Solved(NamedTuple):
+    """Survey, its solution, and the SfM model, of which the solution leaves the lenses as they are."""
+
+    survey: Survey
+    solution: Solution
+    sparse: SparseModel
+
+
 @pytest.fixture
-def trained() -> TrainedSurvey:
+def solved() -> Solved:
     """Exact cameras in a frame `model` that is turned against `geo`."""
     truth, rng = make_scene(images=8, points=20), np.random.default_rng(0)
     geo_from_model = MODEL_FROM_GEO.inverse()
     rotation = np.swapaxes(truth.geo_from_cam, 1, 2) @ geo_from_model.rotation
     poses = CameraPoses(rotation, MODEL_FROM_GEO.apply(truth.center_in_geo))
     cameras = trained_cameras(truth.names, poses)
-    return TrainedSurvey(
-        survey=survey_of(truth, EXACT, Measured(gcps=True), rng),
-        sfm=sparse_model(truth, EXACT, rng),
-        model=trained_model(geo_from_model, MODEL_FROM_GEO @ GEO_FROM_LOCAL, cameras=cameras),
-        gaussians=gaussians_of_size(np.zeros((1, 3)), np.zeros((1, 3)), np.ones(1)),
-    )
+    survey, sparse = survey_of(truth, EXACT, Measured(gcps=True), rng), sparse_model(truth, EXACT, rng)
+    return Solved(survey, trained_model(geo_from_model, MODEL_FROM_GEO @ GEO_FROM_LOCAL, cameras=cameras), sparse)
 
 
 def surveyed(points: tuple[SurveyedPoint, ...]) -> np.ndarray:
     return np.array([point.position_in_geo for point in points])
 
 
-def planes(trained: TrainedSurvey, height_m: float) -> dict[int, np.ndarray]:
+def planes(solved: Solved, height_m: float) -> dict[int, np.ndarray]:
     """Depth maps (along z) of a level plane in geo, by camera."""
     v, u = np.mgrid[0 : PINHOLE.height, 0 : PINHOLE.width] + 0.5
     ray = np.stack([(u - PINHOLE.cx) / PINHOLE.fx, (v - PINHOLE.cy) / PINHOLE.fy, np.ones_like(u)], axis=-1)
-    depth = {}
-    for index, rotation in enumerate(trained.poses.cam_from_model):
-        direction = ray @ (trained.geo_from_model.rotation @ rotation.T).T
-        center = trained.geo_from_model.apply(trained.poses.cam_center_in_model[index])
+    depth, poses, geo_from_model = {}, solved.solution.poses, solved.solution.similarity
+    for index, rotation in enumerate(poses.cam_from_model):
+        direction = ray @ (geo_from_model.rotation @ rotation.T).T
+        center = geo_from_model.apply(poses.cam_center_in_model[index])
         along = (height_m - center[2]) / np.minimum(direction[..., 2], -1e-9)
         depth[index] = np.where(direction[..., 2] < -0.05, along, 0.0)
     return depth
@@ -68,32 +74,30 @@ def maps(rays: MarkRays, depth_m: dict[int, np.ndarray]) -> list[DepthMap]:
     return [DepthMap(PINHOLE, depth_m[int(camera)]) for camera in rays.camera]
 
 
-def measured(
-    trained: TrainedSurvey, points: tuple[SurveyedPoint, ...], depth_m: dict[int, np.ndarray]
-) -> np.ndarray:
-    rays = mark_rays(points, trained.sparse)
-    return points_on_surface(trained, rays, maps(rays, depth_m))
+def measured(solved: Solved, points: tuple[SurveyedPoint, ...], depth_m: dict[int, np.ndarray]) -> np.ndarray:
+    rays = mark_rays(points, solved.sparse)
+    return points_on_surface(solved.solution, rays, maps(rays, depth_m))
 
 
-def test_rays_meet_in_the_surveyed_point(trained: TrainedSurvey) -> None:
-    points = trained.survey.control_points
-    found = triangulated_points(trained, mark_rays(points, trained.sparse))
+def test_rays_meet_in_the_surveyed_point(solved: Solved) -> None:
+    points = solved.survey.control_points
+    found = triangulated_points(solved.solution, mark_rays(points, solved.sparse))
     np.testing.assert_allclose(found, surveyed(points), atol=1e-6)
 
 
-def test_depth_gives_the_surveyed_point(trained: TrainedSurvey) -> None:
+def test_depth_gives_the_surveyed_point(solved: Solved) -> None:
     # The surface is a plane at the point's height: inverse depth is linear, so that interpolation is exact.
-    points = trained.survey.control_points[:1]
-    rays = mark_rays(points, trained.sparse)
-    depth = planes(trained, points[0].position_in_geo[2])
-    found = points_on_surface(trained, rays, maps(rays, depth))
+    points = solved.survey.control_points[:1]
+    rays = mark_rays(points, solved.sparse)
+    depth = planes(solved, points[0].position_in_geo[2])
+    found = points_on_surface(solved.solution, rays, maps(rays, depth))
     np.testing.assert_allclose(found, surveyed(points), atol=1e-5)
 
 
-def test_windows_around_the_marks_are_enough(trained: TrainedSurvey) -> None:
-    points, rng = trained.survey.control_points[:1], np.random.default_rng(6)
-    rays = mark_rays(points, trained.sparse)
-    depth = planes(trained, points[0].position_in_geo[2])
+def test_windows_around_the_marks_are_enough(solved: Solved) -> None:
+    points, rng = solved.survey.control_points[:1], np.random.default_rng(6)
+    rays = mark_rays(points, solved.sparse)
+    depth = planes(solved, points[0].position_in_geo[2])
     rough = {i: each * (1 + 0.002 * rng.standard_normal(each.shape)) for i, each in depth.items()}
     windows = []
     for camera, xy in zip(rays.camera.tolist(), rays.xy, strict=True):
@@ -101,61 +105,62 @@ def test_windows_around_the_marks_are_enough(trained: TrainedSurvey) -> None:
         left, top = max(column - 1, 0), max(row - 1, 0)
         windows.append(DepthMap(PINHOLE, rough[camera][top : row + 2, left : column + 2], left, top))
     np.testing.assert_array_equal(
-        points_on_surface(trained, rays, windows), points_on_surface(trained, rays, maps(rays, rough))
+        points_on_surface(solved.solution, rays, windows),
+        points_on_surface(solved.solution, rays, maps(rays, rough)),
     )
 
 
-def test_surface_at_another_height_is_measured_as_such(trained: TrainedSurvey) -> None:
-    points = trained.survey.control_points[:1]
-    depth = planes(trained, points[0].position_in_geo[2] - 1.0)
-    found = measured(trained, points, depth)
+def test_surface_at_another_height_is_measured_as_such(solved: Solved) -> None:
+    points = solved.survey.control_points[:1]
+    depth = planes(solved, points[0].position_in_geo[2] - 1.0)
+    found = measured(solved, points, depth)
     assert found[0, 2] - points[0].position_in_geo[2] == pytest.approx(-1.0, abs=0.05)
 
 
-def test_roughness_of_the_surface_is_evened_out(trained: TrainedSurvey) -> None:
+def test_roughness_of_the_surface_is_evened_out(solved: Solved) -> None:
     # 25 pixels of independent noise leave a fifth of it in the middle of their plane.
-    points, rng = trained.survey.control_points[:1], np.random.default_rng(5)
-    rays = mark_rays(points, trained.sparse)
-    depth = planes(trained, points[0].position_in_geo[2])
+    points, rng = solved.survey.control_points[:1], np.random.default_rng(5)
+    rays = mark_rays(points, solved.sparse)
+    depth = planes(solved, points[0].position_in_geo[2])
     roughness = 0.002
     rough = {i: each * (1 + roughness * rng.standard_normal(each.shape)) for i, each in depth.items()}
-    found = points_on_surface(trained, rays, maps(rays, rough))
-    centers = trained.geo_from_model.apply(trained.poses.cam_center_in_model[rays.camera])
+    found = points_on_surface(solved.solution, rays, maps(rays, rough))
+    centers = solved.solution.center_in_geo[rays.camera]
     distance = float(np.linalg.norm(centers - surveyed(points), axis=1).max())
     sigma_of_view = roughness * distance / 5
     assert np.linalg.norm(found - surveyed(points)) < 3 * sigma_of_view * 1.25 / np.sqrt(len(rays.point))
 
 
-def test_wrong_surface_in_few_views_is_outvoted(trained: TrainedSurvey) -> None:
-    points = trained.survey.control_points[:1]
-    rays = mark_rays(points, trained.sparse)
-    depth = planes(trained, points[0].position_in_geo[2])
+def test_wrong_surface_in_few_views_is_outvoted(solved: Solved) -> None:
+    points = solved.survey.control_points[:1]
+    rays = mark_rays(points, solved.sparse)
+    depth = planes(solved, points[0].position_in_geo[2])
     views = sorted({int(i) for i in rays.camera})
     depth[views[0]] = depth[views[0]] * 0.3  # a floater before the camera
     depth[views[1]] = depth[views[1]] * 0.0  # nothing there
-    found = points_on_surface(trained, rays, maps(rays, depth))
+    found = points_on_surface(solved.solution, rays, maps(rays, depth))
     assert np.linalg.norm(found - surveyed(points)) < 0.01
 
 
-def test_points_with_too_few_views_are_not_measured(trained: TrainedSurvey) -> None:
-    first = trained.survey.control_points[0]
+def test_points_with_too_few_views_are_not_measured(solved: Solved) -> None:
+    first = solved.survey.control_points[0]
     lonely = (first.model_copy(update={"marks": first.marks[:1]}), first.model_copy(update={"marks": ()}))
-    rays = mark_rays(lonely, trained.sparse)
-    depth = planes(trained, 0.0)
-    assert np.isnan(triangulated_points(trained, rays)).all()
-    assert np.isnan(points_on_surface(trained, rays, maps(rays, depth))).all()
+    rays = mark_rays(lonely, solved.sparse)
+    depth = planes(solved, 0.0)
+    assert np.isnan(triangulated_points(solved.solution, rays)).all()
+    assert np.isnan(points_on_surface(solved.solution, rays, maps(rays, depth))).all()
 
 
-def test_marks_outside_of_the_map_or_lens_are_no_hits(trained: TrainedSurvey) -> None:
-    first = trained.survey.control_points[0]
+def test_marks_outside_of_the_map_or_lens_are_no_hits(solved: Solved) -> None:
+    first = solved.survey.control_points[0]
     away = first.model_copy(update={"marks": tuple(m.model_copy(update={"x_px": -500.0}) for m in first.marks)})
-    depth = planes(trained, 0.0)
-    found = measured(trained, (away,), depth)
+    depth = planes(solved, 0.0)
+    found = measured(solved, (away,), depth)
     assert np.isnan(found).all()
 
 
-def test_no_points_at_all(trained: TrainedSurvey) -> None:
-    rays = mark_rays((), trained.sparse)
+def test_no_points_at_all(solved: Solved) -> None:
+    rays = mark_rays((), solved.sparse)
     assert rays.xy.shape == (0, 2)
-    assert triangulated_points(trained, rays).shape == (0, 3)
-    assert points_on_surface(trained, rays, []).shape == (0, 3)
+    assert triangulated_points(solved.solution, rays).shape == (0, 3)
+    assert points_on_surface(solved.solution, rays, []).shape == (0, 3)

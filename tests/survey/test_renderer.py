@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import TrainedSurvey
 from tests.scenes import trained_cameras, trained_model
 from tests.splat_scenes import CAMERA, SPACING_M, TEST_VIEWS, RenderedFlight, ground_height
 
@@ -24,10 +26,9 @@ def renderer(flights: list[RenderedFlight]) -> ModelRenderer:
     poses = CameraPoses(np.swapaxes(scene.geo_from_cam, 1, 2), scene.center_in_geo)
     cameras = trained_cameras(scene.names, poses, test=TEST_VIEWS)
     model = trained_model(Similarity(), max_image_size=CAMERA.width, cameras=cameras)
-    trained = TrainedSurvey(rendered.survey, rendered.sparse, model, rendered.gaussians)
     workspace = flights[0].workspace("renderer")
     images = photographs(rendered.sparse, rendered.survey, workspace, CAMERA.width)
-    return ModelRenderer(trained, images, CpuRasterizer())
+    return ModelRenderer(model, rendered.sparse, rendered.gaussians, images, CpuRasterizer())
 
 
 @pytest.mark.parametrize("index", [0, 5])
@@ -39,7 +40,7 @@ def test_render_is_the_photograph(renderer: ModelRenderer, index: int) -> None:
 
 @pytest.mark.parametrize("index", [0, 5])
 def test_depth_is_that_of_the_ground(renderer: ModelRenderer, index: int) -> None:
-    depth, camera, poses = renderer.depth_m(index), renderer.pinholes.of(index), renderer.trained.poses
+    depth, camera, poses = renderer.depth_m(index), renderer.pinholes.of(index), renderer.poses
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
     place = (depth[..., None] * ray) @ poses.cam_from_model[index] + poses.cam_center_in_model[index]
@@ -50,3 +51,19 @@ def test_depth_is_that_of_the_ground(renderer: ModelRenderer, index: int) -> Non
     # centre, the surface is off by that much of the slope; uphill and downhill cancel.
     assert np.abs(np.median(height)) < 0.1
     assert np.quantile(np.abs(height), 0.9) < 0.3 * SPACING_M / np.sqrt(2) + 0.1
+
+
+def test_key_changes_with_what_the_surface_depends_on(renderer: ModelRenderer) -> None:
+    """A deliverable takes the maps of another for its own, by this key."""
+    model, poses, gaussians = renderer.model, renderer.poses, renderer.gaussians
+    moved = replace(poses, cam_center_in_model=poses.cam_center_in_model + np.array([0, 0, 1e-6]))
+    cameras = trained_cameras([camera.name for camera in model.cameras], moved, test=TEST_VIEWS)
+    opacity = torch.nextafter(gaussians.logit_opacities, torch.tensor(9.0))
+    others = [
+        (model, gaussians),
+        (model, replace(gaussians, logit_opacities=opacity)),
+        (model.model_copy(update={"mip_filter": True}), gaussians),
+        (model.model_copy(update={"cameras": cameras}), gaussians),
+    ]
+    keys = {ModelRenderer(m, renderer.sfm, g, renderer.images, renderer.backend).key() for m, g in others}
+    assert len(keys) == 4 and renderer.key() in keys

@@ -98,7 +98,7 @@ def test_content_that_is_no_report_is_refused(content: bytes, tmp_path: Path) ->
     path.write_bytes(content)
     with refused("report-invalid", InputError) as error:
         read_report(path)
-    assert error.value.path == path and "`georef evaluate --force`" in error.value.message
+    assert error.value.path == path and "`georef evaluate --force`" in error.value.remedy
 
 
 def test_figures_of_the_wrong_kind_are_refused_by_name(tmp_path: Path) -> None:

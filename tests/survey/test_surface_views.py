@@ -33,8 +33,9 @@ class Renderer:
         self.images: Any = None
         self.pinholes = SimpleNamespace(of=lambda _index: CAMERA)
         poses = CameraPoses(np.tile(DOWN, (5, 1, 1)), np.array(CENTERS))
-        self.trained = SimpleNamespace(
-            poses=poses, geo_from_model=GEO_FROM_MODEL, indices=lambda split: TRAINING if split == "train" else [2]
+        self.poses = poses
+        self.model = SimpleNamespace(
+            similarity=GEO_FROM_MODEL, indices=lambda split: TRAINING if split == "train" else [2]
         )
 
     def surface(self, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -76,8 +77,6 @@ def test_interrupted_maps_are_continued(tmp_path: Path) -> None:
     complete = Renderer()
     opened(complete, tmp_path)
     assert complete.rendered == []
-    views.close()
-    assert not tmp_path.exists()
 
 
 def test_unconfirmed_depths_are_left_out(tmp_path: Path) -> None:

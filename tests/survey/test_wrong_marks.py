@@ -61,16 +61,16 @@ def test_the_result_is_as_good_as_without_them() -> None:
     survey, model = flown("orbit")
     points, wrong = spoiled(survey.control_points, 5)
     located = geolocate(survey, model, GeolocateOptions()).points
-    clean = estimate_similarity(survey, model, located, InitSim3Options())
-    spoilt = estimate_similarity(
+    clean, no_warnings = estimate_similarity(survey, model, located, InitSim3Options())
+    spoilt, warnings = estimate_similarity(
         survey.model_copy(update={"control_points": points}), model, located, InitSim3Options()
     )
-    assert spoilt.initial.control_outliers == clean.initial.control_outliers == ()
-    assert spoilt.initial.cautions == clean.initial.cautions
-    assert codes(clean.warnings) == []
-    sentence = said(spoilt.warnings, "wrong-marks")
+    assert spoilt.solution.control_outliers == clean.solution.control_outliers == ()
+    assert spoilt.solution.cautions == clean.solution.cautions
+    assert codes(no_warnings) == []
+    sentence = said(warnings, "wrong-marks")
     assert all(f"{image} of point {point} (" in sentence for point, image in wrong)
-    error = [one.initial.residuals["gcp"].rmse_3d_m for one in (spoilt, clean)]
+    error = [one.solution.initial.residuals["gcp"].rmse_3d_m for one in (spoilt, clean)]
     assert error[0] == pytest.approx(error[1], rel=0.1)
 
 

@@ -123,7 +123,7 @@ def test_crops_add_up_to_the_loss_of_the_photograph(images: ImageCache, region: 
 
 def recorded(images: ImageCache, crops: Crops | None, iterations: int) -> tuple[Tensor, Tensor]:
     """Gradients and observations that density control has recorded in a training in which nothing moves."""
-    options = JointOptions(10_000, sh_degree=0, crops=crops, camera_rate=0, similarity_rate=0)
+    options = JointOptions(10_000, sh_degree=0, crops=crops, solution_rate=0)
     trainer = tiny.trainer(images, options)
     trainer.optimizer.rate_factor = 0.0
     trainer.strategy = DefaultStrategy(

@@ -17,7 +17,7 @@ from pipelines.splat.rasterizer import cuda, cuda_kernels
 from pipelines.survey.block_plan import BlockPlan, BlockTraining
 from pipelines.survey.report import EvaluationReport
 from pipelines.survey.report_parts import LidarReport
-from pipelines.survey.trained_model import TrainedModel
+from pipelines.survey.solution import TrainedModel
 from pipelines.train import trainer
 from tests.block_scenes import georef, make_field, write_field
 from tests.gsplat_on_cpu import gsplat_on_cpu
@@ -49,12 +49,12 @@ def evaluated(flight: RenderedFlight, options: dict[str, object], backend: str, 
 
 # Without density control, which would turn differences of rounding into differences of tenths of a dB.
 # Photographs of 48 × 36 px: the kernels are plain torch.
-SAME = {"iterations": 200, "sh_degree": 1, "max_image_size": 48, "max_gaussians": 500}
+SAME = {"georeference": "joint", "iterations": 200, "sh_degree": 1, "max_image_size": 48, "max_gaussians": 500}
 VARIANTS = {
     "mcmc": {"strategy": "mcmc", "iterations": 60},
     "fast": {"strategy": "fast", "robust_photometric": True},
     "crops": {"crop_size": 32, "geometry_regularisation": False},
-    "frozen": {"optimize_cameras": False, "exposure": False, "sh_degree": 3},
+    "frozen": {"georeference": "frozen", "exposure": False, "sh_degree": 3},
 }
 
 

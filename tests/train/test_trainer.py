@@ -11,18 +11,19 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from pipelines.adjust.solution import posterior_of
 from pipelines.core.workspace import Workspace
 from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.survey.scene import photographs
-from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.geographic.problem import frozen_problem, refining_problem
+from pipelines.survey.scene import load_adjusted_scene, photographs
+from pipelines.train.georeference.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
+from pipelines.train.solution_state import measured_problem
 from pipelines.train.trainer import JointTrainer, load_checkpoint, make_trainer, save_checkpoint
 from tests.splat_scenes import Rendered, make_rendered, write_photographs, write_rendered
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-CONFIG = TrainOptions(iterations=60, sh_degree=2, max_gaussians=1000)
+CONFIG = TrainOptions(georeference="joint", iterations=60, sh_degree=2, max_gaussians=1000)
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +39,14 @@ def workspace(rendered: Rendered, tmp_path_factory: pytest.TempPathFactory) -> W
 
 
 def trainer_of(workspace: Workspace, config: TrainOptions = CONFIG) -> JointTrainer:
-    adjusted = AdjustedScene.load(workspace)
-    images = photographs(adjusted.scene.sparse, adjusted.survey, workspace, 640)
+    solution, survey, scene = load_adjusted_scene(workspace)
+    images = photographs(scene.sparse, survey, workspace, 640)
     refines = config.refined_cameras(len(images)) > 0
-    problem = refining_problem(adjusted, adjusted.measured(), config) if refines else frozen_problem(adjusted)
-    return make_trainer(TrainingScene(adjusted.scene, images), problem, rasterizer("cpu"), config)
+    problem = frozen_problem(solution, scene)
+    if refines:
+        posterior = posterior_of(workspace, solution, scene.sparse)
+        problem = refining_problem(posterior, survey, scene, measured_problem(solution, survey, scene), config)
+    return make_trainer(TrainingScene(scene, images), problem, rasterizer("cpu"), config)
 
 
 class ReadsOfValues(TorchDispatchMode):
@@ -80,15 +84,14 @@ def test_an_iteration_reads_no_value(workspace: Workspace, strategy: str) -> Non
 def test_a_step_moves_everything(workspace: Workspace) -> None:
     trainer = trainer_of(workspace)
     before = {name: tensor.detach().clone() for name, tensor in trainer.optimizer.gaussians.tensors().items()}
-    start = trainer.problem.cameras.z.detach().clone()
+    start = trainer.problem.unknowns.w.detach().clone()
     report = trainer.step()
     assert trainer.iteration == 1
     assert 0 < report.weight < 0.05
     assert float(report.losses["photometric"]) > 0
     after = trainer.optimizer.gaussians.tensors()
     assert any(not torch.equal(before[name], after[name].detach()) for name in before)
-    assert float(trainer.problem.similarity.y.detach().abs().max()) > 0
-    assert not torch.equal(trainer.problem.cameras.z, start)
+    assert not torch.equal(trainer.problem.unknowns.w, start)
 
 
 def test_state_restores_the_next_step_exactly(workspace: Workspace, tmp_path: Path) -> None:
@@ -116,15 +119,16 @@ def test_state_of_a_run_that_has_not_begun(workspace: Workspace, tmp_path: Path)
 
 def test_views_are_seen_through_the_lens_that_follows(workspace: Workspace) -> None:
     one, two = trainer_of(workspace), trainer_of(workspace)
-    before, basis = one.pinholes.of(0), one.problem.cameras.lens_basis
-    with torch.no_grad():  # toward a focal length two per cent longer
-        one.problem.cameras.z.copy_(2 * basis[0] / basis[0].square().sum())
+    before, unknowns = one.pinholes.of(0), one.problem.unknowns
+    (basis,) = torch.autograd.grad(unknowns.lens()[0], unknowns.w)
+    with torch.no_grad():  # toward a focal length two pixels longer
+        unknowns.w.copy_(2 * basis / basis.square().sum())
     one.step()
-    fx = float(one.problem.cameras.lens()[0].detach()) + before.fx
+    fx = float(one.problem.unknowns.lens()[0].detach()) + before.fx
     assert one.pinholes.of(0).fx == pytest.approx(fx, abs=0.1)  # but for the step itself
     # It stays for a hundred iterations, whatever the cameras do, also for who goes on from there.
     with torch.no_grad():
-        one.problem.cameras.z.zero_()
+        one.problem.unknowns.w.zero_()
     two.restore(one.state())
     one.step(), two.step()
     assert two.pinholes.of(0) == one.pinholes.of(0) != before
@@ -134,20 +138,20 @@ def test_views_are_seen_through_the_lens_that_follows(workspace: Workspace) -> N
 
 
 def test_cameras_that_were_solved_once_do_not_move(workspace: Workspace) -> None:
-    trainer = trainer_of(workspace, CONFIG.model_copy(update={"solve_cameras": "once"}))
+    trainer = trainer_of(workspace, CONFIG.model_copy(update={"georeference": "frozen"}))
     problem = trainer.problem
-    center, similarity = problem.cameras.moved()[1].detach().clone(), problem.similarity.current()
-    lens, affine = problem.cameras.lens().clone(), trainer.exposures.affine.clone()  # type: ignore[union-attr]
+    center, similarity = problem.unknowns.moved()[1].detach().clone(), problem.unknowns.current_similarity()
+    lens, affine = problem.unknowns.lens().clone(), trainer.exposures.affine.clone()  # type: ignore[union-attr]
     sh = trainer.optimizer.gaussians.sh.detach().clone()
     for _ in range(3):
         report = trainer.step()
     assert float(report.losses["geographic"]) == 0
-    assert torch.equal(problem.cameras.moved()[1], center)
-    np.testing.assert_array_equal(problem.similarity.current().translation, similarity.translation)
-    assert torch.equal(problem.cameras.lens(), lens)
+    assert torch.equal(problem.unknowns.moved()[1], center)
+    np.testing.assert_array_equal(problem.unknowns.current_similarity().translation, similarity.translation)
+    assert torch.equal(problem.unknowns.lens(), lens)
     assert not torch.equal(trainer.exposures.affine, affine)  # type: ignore[union-attr]
     assert not torch.equal(trainer.optimizer.gaussians.sh.detach(), sh)
     # SfM's cameras differ from the adjustment, and training renders from the adjustment.
-    adjusted = AdjustedScene.load(workspace)
-    np.testing.assert_allclose(center, adjusted.adjustment.poses.cam_center_in_model, atol=1e-9)
-    assert np.abs(adjusted.scene.poses.cam_center_in_model - center.numpy()).max() > 1e-4
+    solution, _, scene = load_adjusted_scene(workspace)
+    np.testing.assert_allclose(center, solution.poses.cam_center_in_model, atol=1e-9)
+    assert np.abs(scene.poses.cam_center_in_model - center.numpy()).max() > 1e-4

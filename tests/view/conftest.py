@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipelines.core.workspace import Workspace
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.options import CrsOptions
 from pipelines.view.measuring import MeasuringModel
 from tests.splat_scenes import make_rendered
@@ -20,4 +21,4 @@ def viewed(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
 @pytest.fixture(scope="session")
 def model(viewed: Workspace) -> MeasuringModel:
     """The hill, to measure in."""
-    return MeasuringModel(viewed, renderer_of(viewed), CrsOptions())
+    return MeasuringModel(viewed, load_survey(viewed), renderer_of(viewed), CrsOptions())

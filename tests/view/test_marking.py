@@ -10,8 +10,8 @@ import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.formats.ground_points import read_ground_points
+from pipelines.survey.marks import triangulated_points
 from pipelines.survey.survey import SurveyedPoint
-from pipelines.survey.trained_survey import triangulated_points
 from pipelines.view.marking import (
     CHECK,
     CONTROL,
@@ -29,29 +29,29 @@ PLACE = np.array([3.0, -2.0, 5.8])
 
 
 def test_a_point_appears_where_its_marks_intersect_again(model: MeasuringModel) -> None:
-    trained = model.trained
-    shown = appears_in(PLACE, trained)
-    assert len(shown) == len(trained.sparse.image_name)  # all cameras look at the hill
-    marks = {trained.sparse.image_name[camera]: (float(x), float(y)) for camera, (x, y) in shown}
-    rays = rays_of(MarkedPoint("P", None, marks=marks), trained)
-    found = triangulated_points(trained, rays)[0]
+    solution, sparse = model.solution, model.reader.renderer.sparse
+    shown = appears_in(PLACE, solution, sparse)
+    assert len(shown) == len(sparse.image_name)  # all cameras look at the hill
+    marks = {sparse.image_name[camera]: (float(x), float(y)) for camera, (x, y) in shown}
+    rays = rays_of(MarkedPoint("P", None, marks=marks), sparse)
+    found = triangulated_points(solution, rays)[0]
     np.testing.assert_allclose(found, PLACE, atol=1e-6)
-    assert residuals_px(PLACE, rays, trained).max() < 1e-4
+    assert residuals_px(PLACE, rays, solution).max() < 1e-4
     # A mark that is 5 px off shows it, and the others hardly move.
     image, (x, y) = next(iter(marks.items()))
-    wrong = rays_of(MarkedPoint("P", None, marks={**marks, image: (x + 5.0, y)}), trained)
-    residual = residuals_px(triangulated_points(trained, wrong)[0], wrong, trained)
-    names = [trained.sparse.image_name[camera] for camera in wrong.camera]
+    wrong = rays_of(MarkedPoint("P", None, marks={**marks, image: (x + 5.0, y)}), sparse)
+    residual = residuals_px(triangulated_points(solution, wrong)[0], wrong, solution)
+    names = [sparse.image_name[camera] for camera in wrong.camera]
     assert residual[names.index(image)] == pytest.approx(5.0, abs=1.5)
     assert np.median(residual) < 1.0
 
 
 def test_points_behind_all_cameras_appear_nowhere(model: MeasuringModel) -> None:
-    assert appears_in(np.array([0.0, 0.0, 500.0]), model.trained) == []
+    assert appears_in(np.array([0.0, 0.0, 500.0]), model.solution, model.reader.renderer.sparse) == []
 
 
 def test_files_of_marks_are_read_again(tmp_path: Path, model: MeasuringModel) -> None:
-    survey = model.trained.survey
+    survey = model.survey
 
     def xyz_of(points: tuple[SurveyedPoint, ...]) -> np.ndarray:
         position = np.array([point.position_in_geo for point in points]).reshape(-1, 3)

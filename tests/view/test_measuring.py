@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +11,8 @@ from pipelines.core.errors import MissingProductError
 from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.workspace import Workspace
 from pipelines.surface.picking import NoSurface, Sight, SurfacePoint, depth_around, points_on_surface
+from pipelines.surface.surface_views import ModelRenderer
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.options import CrsOptions
 from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel, WantedBase
@@ -59,12 +59,12 @@ def test_points_under_lines_of_sight_lie_on_the_hill(model: MeasuringModel, star
 
 
 def test_surveyed_points_are_measured_as_by_evaluate(model: MeasuringModel) -> None:
-    survey, renderer = model.trained.survey, model.reader.renderer
-    rays = mark_rays(survey.check_points, model.trained.sparse)
+    survey, renderer = model.survey, model.reader.renderer
+    rays = mark_rays(survey.check_points, renderer.sparse)
     maps = [depth_around(renderer, int(camera), xy) for camera, xy in zip(rays.camera, rays.xy, strict=True)]
-    expected = points_on_surface(model.trained, rays, maps)
+    expected = points_on_surface(model.solution, rays, maps)
     for row, point in enumerate(survey.check_points):
-        measured = model.reader.behind_marks(mark_rays((point,), model.trained.sparse))
+        measured = model.reader.behind_marks(mark_rays((point,), renderer.sparse))
         assert isinstance(measured, SurfacePoint)
         np.testing.assert_allclose(measured.position_in_geo, expected[row], atol=1e-9)
 
@@ -78,11 +78,11 @@ def test_nothing_is_measured_where_nothing_is(model: MeasuringModel) -> None:
 def test_what_photographs_look_through_is_no_surface(viewed, model: MeasuringModel) -> None:
     # A disc in the air that the model has and no training view agrees on: from above, it hides the hill.
     renderer = renderer_of(viewed)
-    gaussians = renderer.trained.gaussians
+    gaussians = renderer.gaussians
     row = int(np.argmin(np.linalg.norm(gaussians.means.numpy()[:, :2] - [4.0, 4.0], axis=1)))
     gaussians.means[row, 2] = 24.0
     gaussians.log_scales[row] = np.log(0.15)
-    shown = MeasuringModel(viewed, renderer, CrsOptions())
+    shown = MeasuringModel(viewed, load_survey(viewed), renderer, CrsOptions())
     place = gaussians.means[row].double().numpy()
     point = shown.reader.under(sight([place[0], place[1], 60.0], place))
     assert not isinstance(point, SurfacePoint) or abs(point.position_in_geo[2] - 24.0) > 10
@@ -133,7 +133,7 @@ def test_areas_volumes_and_a_profile_of_the_hill(model: MeasuringModel) -> None:
 def test_shared_errors_cancel_in_distances(model: MeasuringModel) -> None:
     near = [model.reader.under(sight([0.0, 0.0, 60.0], on_ground(east, 2.0))) for east in (1.0, 3.0)]
     points = [point for point in near if isinstance(point, SurfacePoint)]
-    _, sigma_m = model.place(points[0])
+    _, sigma_m = model.coordinates(points[0])
     distance, plan, rise = distances(model.jointly(points))
     assert sigma_m is not None
     assert distance.sigma is not None and plan.sigma is not None and rise.sigma is not None
@@ -148,17 +148,18 @@ def test_no_sigma_is_stated_that_nothing_checks(viewed: Workspace, model: Measur
     """And the viewer solves nothing: without a stored posterior there is none."""
     renderer = model.reader.renderer
     unchecked = (Remark(code=NOT_CHECKED, sentence="Nothing checks the positions."),)
-    trained = replace(renderer.trained, model=renderer.trained.model.model_copy(update={"cautions": unchecked}))
-    fresh = MeasuringModel(viewed, SimpleNamespace(trained=trained), CrsOptions())  # type: ignore[arg-type]
+    silent = renderer.model.model_copy(update={"cautions": unchecked})
+    other = ModelRenderer(silent, renderer.sfm, renderer.gaussians, renderer.images, renderer.backend)
+    fresh = MeasuringModel(viewed, model.survey, other, CrsOptions())
     assert fresh.posterior is None and "nothing checks" in fresh.without_sigma
     with pytest.raises(MissingProductError, match=r"train/adjustment\.npz"):
-        MeasuringModel(Workspace(tmp_path), renderer, CrsOptions())
+        MeasuringModel(Workspace(tmp_path), model.survey, renderer, CrsOptions())
 
 
 @pytest.mark.parametrize("spread", ["normal", "whole pixels"])
 def test_sigma_of_a_click_is_that_of_a_persons_pixel(model: MeasuringModel, spread: str) -> None:
     """Thirty distances, clicked a pixel beside the place: their error over the σ of pointing alone."""
-    rng, frame = np.random.default_rng(11), frame_of(model.trained)
+    rng, frame = np.random.default_rng(11), frame_of(model.solution, model.reader.renderer.sfm)
     position = np.array([18.0, -42.0, 30.0])
     forward = -position / np.linalg.norm(position)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -174,7 +175,7 @@ def test_sigma_of_a_click_is_that_of_a_persons_pixel(model: MeasuringModel, spre
     ratios = []
     for _ in range(30):
         places = [on_ground(*rng.uniform(-11, 11, 2)) for _ in range(2)]
-        pixels = [camera.pinhole().project(rotation @ (frame.place(place) - position)) for place in places]
+        pixels = [camera.pinhole().project(rotation @ (frame.from_geo(place) - position)) for place in places]
         off = rng.normal(size=(2, 2)) if spread == "normal" else rng.integers(-1, 2, (2, 2))
         true = [clicked(np.array(pixel)) for pixel in pixels]
         wrong = [clicked(np.array(pixel) + by) for pixel, by in zip(pixels, off, strict=True)]

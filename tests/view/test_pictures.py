@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import itertools
 import threading
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from pipelines.adjust.accuracy_grid import AccuracyGrid
+from pipelines.core.stages import GAUSSIANS
 from pipelines.core.workspace import Workspace
-from pipelines.splat.gaussians import Gaussians
-from pipelines.splat.rasterizer.cpu import CpuRasterizer
+from pipelines.splat.gaussians import Gaussians, read_gaussians
 from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.scene import photographs
-from pipelines.survey.trained_survey import TrainedSurvey, load_trained
+from pipelines.survey.calibrated import load_survey
+from pipelines.survey.solution import read_sfm, read_solution
 from pipelines.view import motion
-from pipelines.view.pictures import Painter, Photographs, ViewerCamera, Wanted, frame_of
+from pipelines.view.pictures import Painter, Photographs, ViewerCamera, ViewFrame, Wanted, frame_of
+from tests.view_scenes import renderer_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -26,17 +26,27 @@ FEW = 4000
 
 
 def painter_of(
-    workspace: Workspace, trained: TrainedSurvey, grid: AccuracyGrid | None = None
+    workspace: Workspace,
+    monkeypatch: pytest.MonkeyPatch,
+    grid: AccuracyGrid | None = None,
+    gaussians: Gaussians | None = None,
 ) -> tuple[Painter, list[int]]:
-    """Return the painter of a survey, and the numbers of Gaussians that it has made models of."""
-    images = photographs(trained.sfm, trained.survey, workspace, trained.model.max_image_size)
-    made: list[int] = []
+    """Return the painter of a workspace, and the numbers of Gaussians that it has made models of."""
+    renderer, made, showing = renderer_of(workspace), list[int](), ModelRenderer.showing
+    renderer = renderer if gaussians is None else renderer.showing(gaussians)
 
-    def renderer_of(shown: TrainedSurvey) -> ModelRenderer:
-        made.append(len(shown.gaussians))
-        return ModelRenderer(shown, images, CpuRasterizer())
+    def counted(self: ModelRenderer, shown: Gaussians) -> ModelRenderer:
+        made.append(len(shown))
+        return showing(self, shown)
 
-    return Painter(renderer_of, Photographs(workspace, trained), trained, frame_of(trained), grid), made
+    monkeypatch.setattr(ModelRenderer, "showing", counted)
+    photographs = Photographs(workspace, load_survey(workspace), renderer.sparse)
+    return Painter(renderer, photographs, frame_of(renderer.model, renderer.sfm), grid), made
+
+
+def _frame(workspace: Workspace) -> ViewFrame:
+    solution = read_solution(workspace)
+    return frame_of(solution, read_sfm(workspace, solution))
 
 
 def from_above(half_m: float, at: tuple[float, float] = (0.0, 0.0), width: int = 160) -> ViewerCamera:
@@ -48,10 +58,9 @@ def test_a_picture_that_moves_shows_the_scene_with_fewer_gaussians(
     viewed: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(motion, "MOST_GAUSSIANS", FEW)
-    trained = load_trained(viewed)
-    painter, made = painter_of(viewed, trained)
+    painter, made = painter_of(viewed, monkeypatch)
     painter.prepare_motion(threading.Event())
-    assert made[0] == len(trained.gaussians) > 3 * FEW
+    assert made[0] == len(read_gaussians(viewed.path(GAUSSIANS))) > 3 * FEW
     assert all(later <= 0.5 * earlier for earlier, later in itertools.pairwise(made)) and made[-1] <= FEW
     # The whole hill: 40 pixels over 36 m, so that a cell of the coarse model is about two of them, and so is a
     # patch of one random colour: most of the pattern stays. Merged discs let a few percent of the black through.
@@ -76,7 +85,7 @@ def test_small_models_and_viewers_that_ended_make_none(
     if ended_before:
         monkeypatch.setattr(motion, "MOST_GAUSSIANS", 100)
         ended.set()
-    painter, made = painter_of(viewed, load_trained(viewed))
+    painter, made = painter_of(viewed, monkeypatch)
     painter.prepare_motion(ended)
     assert len(made) == 1
     camera = from_above(18.0, width=40)
@@ -85,18 +94,17 @@ def test_small_models_and_viewers_that_ended_make_none(
     )
 
 
-def test_unknown_sigma_is_grey_beyond_the_scene(viewed: Workspace) -> None:
+def test_unknown_sigma_is_grey_beyond_the_scene(viewed: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
     """σ is known west of the middle only: the east must not have the colour of the rim, of a good σ."""
-    trained = load_trained(viewed)
     to_middle, all_along = np.arange(-30.0, 0.5, 2.0), np.arange(-30.0, 30.5, 2.0)
     east, north = (axis.ravel() for axis in np.meshgrid(to_middle, all_along))
-    middle = frame_of(trained).middle_in_geo
+    middle = _frame(viewed).middle_in_geo
     position = middle + np.column_stack([east, north, np.zeros_like(east)])
     sigma_m = 0.02 + 0.001 * np.arange(len(east))
     cell = np.stack([(east + 30) // 2, (north + 30) // 2], axis=1).astype(np.int64)
     cov = sigma_m[:, None, None] ** 2 * np.eye(3) / 3
     grid = AccuracyGrid(position, cov, cell, 2.0, middle[:2] - 31.0, (16, 31))
-    painter, _ = painter_of(viewed, trained, grid)
+    painter, _ = painter_of(viewed, monkeypatch, grid)
     view = painter.paint(from_above(10.0), Wanted(colouring="sigma"))
     spread = view.rgb.max(axis=2).astype(int) - view.rgb.min(axis=2)
     assert (spread[:, :72] > 30).mean() > 0.95  # coloured
@@ -110,15 +118,16 @@ def test_unknown_sigma_is_grey_beyond_the_scene(viewed: Workspace) -> None:
         assert ((other.rgb.max(axis=2).astype(int) - other.rgb.min(axis=2)) > 30).mean() > 0.95
 
 
-def test_far_gaussians_fade_but_for_photographs_and_clipping_boxes(viewed: Workspace) -> None:
-    trained = load_trained(viewed)
-    frame = frame_of(trained)
+def test_far_gaussians_fade_but_for_photographs_and_clipping_boxes(
+    viewed: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame, own = _frame(viewed), read_gaussians(viewed.path(GAUSSIANS))
     model_from_view = frame.view_from_model.inverse()
 
     def blob(radii: float) -> Gaussians:
         """Return a large red Gaussian so many radii of the scene east of its middle."""
         at = model_from_view.apply(np.array([[radii * frame.radius_m, 0.0, 0.0]]))
-        sh = torch.zeros(1, trained.gaussians.sh.shape[1], 3)
+        sh = torch.zeros(1, own.sh.shape[1], 3)
         sh[0, 0] = torch.tensor([1.7, -1.7, -1.7])
         return Gaussians(
             means=torch.from_numpy(at).float(),
@@ -128,8 +137,8 @@ def test_far_gaussians_fade_but_for_photographs_and_clipping_boxes(viewed: Works
             sh=sh,
         )
 
-    gaussians = Gaussians.concatenate([trained.gaussians, *(blob(radii) for radii in (1.9, 2.5, 3.5))])
-    painter, _ = painter_of(viewed, replace(trained, gaussians=gaussians))
+    gaussians = Gaussians.concatenate([own, *(blob(radii) for radii in (1.9, 2.5, 3.5))])
+    painter, _ = painter_of(viewed, monkeypatch, gaussians=gaussians)
 
     def redness(radii: float, wanted: Wanted) -> float:
         camera = from_above(0.02 * frame.radius_m, at=(radii * frame.radius_m, 0.0), width=16)

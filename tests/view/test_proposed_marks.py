@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,8 +12,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.workspace import Workspace
 from pipelines.formats.ground_points import read_marks
 from pipelines.geometry.cameras import project
-from pipelines.survey.survey import Mark, SurveyedPoint
-from pipelines.survey.trained_survey import TrainedSurvey
+from pipelines.survey.survey import Mark, Survey, SurveyedPoint
 from pipelines.view.measuring import MeasuringModel
 from pipelines.view.options import ProposalOptions
 from pipelines.view.proposed_marks import propose_marks, proposed_marks
@@ -90,7 +88,7 @@ def test_texture_and_two_targets_are_no_target() -> None:
         assert find_quarters(two.astype(np.uint8), np.array(beyond), 14.0) is None
 
 
-def _with_points(trained: TrainedSurvey, places: np.ndarray, marks: tuple[Mark, ...]) -> TrainedSurvey:
+def _with_points(survey: Survey, places: np.ndarray, marks: tuple[Mark, ...]) -> Survey:
     """Return the survey with points at places (J, 3) alone, the last of which has marks."""
     points = tuple(
         SurveyedPoint(
@@ -100,22 +98,22 @@ def _with_points(trained: TrainedSurvey, places: np.ndarray, marks: tuple[Mark, 
         )
         for j, place in enumerate(places)
     )  # fmt: skip
-    survey = trained.survey.model_copy(update={"control_points": points, "check_points": (), "unmarked_points": ()})
-    return replace(trained, survey=survey)
+    return survey.model_copy(update={"control_points": points, "check_points": (), "unmarked_points": ()})
 
 
 def test_targets_are_proposed_where_the_cameras_expect_them(model: MeasuringModel) -> None:
-    trained, random = model.trained, np.random.default_rng(2)
+    solution, sparse, random = model.solution, model.reader.renderer.sparse, np.random.default_rng(2)
+    poses = solution.poses
     places = np.array([[3.0, -2.0, 5.8], [-6.0, 5.0, 5.0], [9.0, 8.0, 4.0]])
     half_m = 3.0
     pictures, true = [], {}
-    for camera, name in enumerate(trained.sparse.image_name):
-        lens = trained.sparse.camera_of(camera)
+    for camera, name in enumerate(sparse.image_name):
+        lens = sparse.camera_of(camera)
         picture = _ground(random, (lens.height, lens.width))
         for j, place in enumerate(places):
             corners = place + half_m * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-            in_model = trained.geo_from_model.inverse().apply(corners)
-            in_cam = (in_model - trained.poses.cam_center_in_model[camera]) @ trained.poses.cam_from_model[camera].T
+            in_model = solution.similarity.inverse().apply(corners)
+            in_cam = (in_model - poses.cam_center_in_model[camera]) @ poses.cam_from_model[camera].T
             pixel = project(lens, in_cam)
             _draw(picture, pixel[0], (pixel[1:] - pixel[0]).T)
             true[f"P{j}", name] = pixel[0]
@@ -123,11 +121,11 @@ def test_targets_are_proposed_where_the_cameras_expect_them(model: MeasuringMode
         pictures.append(np.repeat(grey[..., None], 3, axis=2))
     hand = tuple(
         Mark(image=name, x_px=true["P2", name][0], y_px=true["P2", name][1], sigma_px=0.5)
-        for name in trained.sparse.image_name[:2]
+        for name in sparse.image_name[:2]
     )
     # Surveyed and adjusted places differ by decimetres: targets are pixels from where they are expected.
-    solved = _with_points(trained, places + np.array([0.3, -0.2, 0.1]), hand)
-    found, left_out = proposed_marks(solved, lambda camera: pictures[camera], 10.0)
+    survey = _with_points(model.survey, places + np.array([0.3, -0.2, 0.1]), hand)
+    found, left_out = proposed_marks(survey, solution, sparse, lambda camera: pictures[camera], 10.0)
     assert len(left_out) <= 1
     assert not {("P2", mark.image) for mark in hand} & {(each.point, each.mark.image) for each in found}
     quarters = [each for each in found if each.how == "quarters"]
@@ -147,4 +145,6 @@ def test_the_table_is_read_as_marks_with_sigma(viewed: Workspace, tmp_path: Path
 
 def test_a_survey_without_points_is_refused(model: MeasuringModel) -> None:
     with refused("no-ground-points", InputError):
-        proposed_marks(_with_points(model.trained, np.empty((0, 3)), ()), lambda _: pytest.fail("read"), 24.0)
+        none = _with_points(model.survey, np.empty((0, 3)), ())
+        sparse = model.reader.renderer.sparse
+        proposed_marks(none, model.solution, sparse, lambda _: pytest.fail("read"), 24.0)

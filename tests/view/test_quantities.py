@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pipelines.view.quantities import (
-    MeasuredPoints,
+    PickedPoints,
     SampledSurface,
     VolumeBase,
     grid_in_polygon,
@@ -21,8 +21,8 @@ from pipelines.view.quantities import (
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def exact(places: np.ndarray, cov: np.ndarray | None = None) -> MeasuredPoints:
-    return MeasuredPoints(places, cov, places[:, 2])
+def exact(places: np.ndarray, cov: np.ndarray | None = None) -> PickedPoints:
+    return PickedPoints(places, cov, places[:, 2])
 
 
 @settings(max_examples=20, deadline=None)

@@ -82,8 +82,13 @@ def difference(layer: Any) -> None:
 
 
 def significant(layer: Any) -> None:
-    """Style classes of change: 1 none, 2 lowered, 3 raised."""
-    classes = {1: ("#00000000", "no significant change"), 2: (_LOWERED, "lowered"), 3: (_RAISED, "raised")}
+    """Style classes of change: 1 none, 2 lowered, 3 raised, 4 doubtful."""
+    classes = {
+        1: ("#00000000", "no significant change"),
+        2: (_LOWERED, "lowered"),
+        3: (_RAISED, "raised"),
+        4: ("#9a9a9a", "doubtful"),
+    }
     entries = [
         QgsPalettedRasterRenderer.Class(value, QColor(colour), text) for value, (colour, text) in classes.items()
     ]

@@ -76,7 +76,7 @@ def difference_histogram(stable_m: FloatArray, changed_m: FloatArray, lod_m: flo
 
 
 @dataclass(frozen=True)
-class Profile:
+class ChangeProfile:
     """Heights of both epochs along a line: distance (N,) in metres, heights and σ (2, N); NaN: not known.
 
     `part` are the distances at which the line enters and leaves the region, two by two.
@@ -88,7 +88,7 @@ class Profile:
     part: tuple[float, ...]
 
 
-def profile_chart(profile: Profile, names: tuple[str, str]) -> bytes:
+def profile_chart(profile: ChangeProfile, names: tuple[str, str]) -> bytes:
     """Return the heights of both epochs, with a band of ± 1.96 σ around each, as PNG."""
     figure = look.new_figure(_PROFILE_INCHES, "constrained")
     axes = figure.add_subplot()

@@ -163,6 +163,7 @@ def add_bearings(axes: Axes) -> None:
 
 
 def add_legend(figure: Figure, columns: int = 4) -> None:
+    """Add the legend of a plan below its axes."""
     look.add_key(figure, columns, loc="lower center", bbox_to_anchor=(0.5, 0.04 / figure.get_figheight()))
 
 

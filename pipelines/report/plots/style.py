@@ -90,6 +90,7 @@ def colours_of(values: FloatArray, low: float, high: float) -> ByteArray:
 
 
 def png_of(figure: Figure) -> bytes:
+    """Return a figure as PNG, the same bytes at each call: without the program's name in its metadata."""
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi="figure", metadata={"Software": None})
     return data.getvalue()

@@ -21,8 +21,9 @@ def chosen_backend(name: Literal["auto", "cpu", "cuda"]) -> BackendName:
     `auto` stands for cuda if nothing that it needs is missing. If there is a GPU, the log says what is missing.
     """
     if name not in ("auto", *BACKENDS):
-        message = f"The rasteriser {name!r} is unknown. Use auto, cpu or cuda."
-        raise BackendUnavailableError("rasteriser-unknown", message)
+        message = f"The rasteriser {name!r} is unknown."
+        remedy = "Use auto, cpu or cuda."
+        raise BackendUnavailableError("rasteriser-unknown", message, remedy=remedy)
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return "cpu"
     from pipelines.splat.rasterizer.cuda_kernels import missing_for_cuda

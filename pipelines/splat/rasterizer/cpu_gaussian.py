@@ -212,11 +212,12 @@ def make_view(camera: Pinhole, settings: RasterSettings, pose: FloatArray) -> Vi
 
 @jit
 def row3(array: Any, i: int) -> Any:
+    """Return row i of an array (N, 3) as three numbers in double precision."""
     return float(array[i, 0]), float(array[i, 1]), float(array[i, 2])
 
 
 @jit
-def point_in_cam(pose: Any, mean: Any) -> Any:
+def transformed_point(pose: Any, mean: Any) -> Any:
     """Return (x, y, z) of a point under the rigid transformation `pose` (3, 4)."""
     x, y, z = mean
     return (
@@ -247,6 +248,7 @@ def rotation(quat: Any) -> Any:
 
 @jit
 def shortest_axis(log_scales: Any, i: int) -> int:
+    """Return the principal axis (0, 1 or 2) of the smallest deviation of Gaussian i; the first of equal ones."""
     a, b, c = row3(log_scales, i)
     shortest = 1 if b < a else 0
     return 2 if c < min(a, b) else shortest
@@ -266,6 +268,7 @@ def facing_normal(turn: Any, axis: int, ray: Any) -> Any:
 
 @jit
 def variances(log_scales: Any, i: int) -> Any:
+    """Return the variances of Gaussian i along its principal axes, from natural logarithms of deviations (N, 3)."""
     a, b, c = row3(log_scales, i)
     return math.exp(2 * a), math.exp(2 * b), math.exp(2 * c)
 

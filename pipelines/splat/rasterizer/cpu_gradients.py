@@ -205,7 +205,7 @@ def unnormalised(direction: Any, scale: float, gradient: Any) -> Any:
 def geometry_gradient(quats: Any, log_scales: Any, i: int, mean: Any, direction: Any, pose: Any, view: View,
                       sums: Any, g_normal: Any, camera: Any, g_quats: Any, g_log_scales: Any) -> Any:  # fmt: skip
     """Write row i of ∂L/∂ quaternion and log scales, add to ∂L/∂ pose; return ∂L/∂ point and screen mean."""
-    point = gaussian.point_in_cam(pose, mean)
+    point = gaussian.transformed_point(pose, mean)
     quat, scale = gaussian.unit_quat(quats, i)
     turn = gaussian.rotation(quat)
     jac = gaussian.jacobian(view, point)

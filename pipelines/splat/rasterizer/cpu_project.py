@@ -37,7 +37,7 @@ ELLIPSE_WIDTH = 6
 @jit
 def _ellipse(means: Any, quats: Any, log_scales: Any, pose: Any, view: View, i: int) -> Any:
     """Return the point in the camera's frame, screen covariance and slope of the depth of Gaussian i."""
-    point = gaussian.point_in_cam(pose, gaussian.row3(means, i))
+    point = gaussian.transformed_point(pose, gaussian.row3(means, i))
     quat, _ = gaussian.unit_quat(quats, i)
     w = gaussian.screen_from_model(gaussian.jacobian(view, point), pose)
     axes = gaussian.times_rotation(w, gaussian.rotation(quat))
@@ -116,7 +116,7 @@ def _find_visible(
     for block in range(worker, (means.shape[0] + BLOCK - 1) // BLOCK, workers):
         for i in range(block * BLOCK, min((block + 1) * BLOCK, means.shape[0])):
             visible[i] = False
-            point = gaussian.point_in_cam(pose, gaussian.row3(means, i))
+            point = gaussian.transformed_point(pose, gaussian.row3(means, i))
             logit = float(logit_opacities[i])
             if not (point[2] >= view.near and logit >= LOGIT_ALPHA_MIN):
                 continue
@@ -225,6 +225,7 @@ RUNS = 32
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
+    """Return the numbers of tiles, across and down, that cover an image of so many pixels."""
     return -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
 
 
@@ -236,6 +237,7 @@ def pack_hit(splat: int, first_row: int, last_row: int) -> int:
 
 @jit
 def unpack_hit(hit: int) -> Any:
+    """Return the three parts of a packed hit: the high bits from 16 on, then two bytes."""
     return hit >> 16, (hit >> 8) & 255, hit & 255
 
 

@@ -149,12 +149,12 @@ def _architectures() -> list[str]:
     named = os.environ.get("TORCH_CUDA_ARCH_LIST", "").replace(";", " ").split()
     found = sorted(name.removesuffix("+PTX") for name in named) or _capabilities()
     if not found:
-        message = (
-            "This machine has no GPU to compile for. Name its compute capability in the variable "
-            "TORCH_CUDA_ARCH_LIST (8.6 for the RTX 30 series, 8.9 for 40, 12.0 for 50, 8.0 for A100, 9.0 for H100; "
-            "several with blanks)."
+        message = "This machine has no GPU to compile for."
+        remedy = (
+            "Name its compute capability in the variable TORCH_CUDA_ARCH_LIST (8.6 for the RTX 30 series, 8.9 for "
+            "40, 12.0 for 50, 8.0 for A100, 9.0 for H100; several with blanks)."
         )
-        raise InputError("gpu-unknown", message)
+        raise InputError("gpu-unknown", message, remedy=remedy)
     if not all(name.replace(".", "").removesuffix("a").isdecimal() for name in found):
         message = f"TORCH_CUDA_ARCH_LIST is {' '.join(named)!r}; numbers like 8.6 with blanks between are expected."
         raise InputError("compute-capability", message)

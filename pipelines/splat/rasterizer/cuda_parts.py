@@ -53,6 +53,7 @@ def compiling_parts() -> tuple[Part, ...]:
 
 
 def gsplat() -> Part:
+    """Return gsplat with its version, or the command that installs it."""
     try:
         return Part("gsplat", f"gsplat {metadata.version('gsplat')}", "")
     except metadata.PackageNotFoundError:

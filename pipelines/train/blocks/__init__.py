@@ -1,1 +1,1 @@
-"""Training in blocks, `georef blocks`: a survey is divided, its blocks are trained apart, and merged."""
+"""Training in blocks: a survey is divided, its blocks are trained apart, and merged."""

@@ -23,14 +23,14 @@ from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.area import boundary_area
 from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
-from pipelines.survey.scene import photographs
-from pipelines.train.adjusted_scene import AdjustedScene
+from pipelines.survey.scene import load_adjusted_scene, photographs
 from pipelines.train.estimate import training_size
-from pipelines.train.geographic.problem import frozen_problem
+from pipelines.train.georeference.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import METRICS, TrainingRecord, train_in_folder
 from pipelines.train.options import BlockTrainOptions
 from pipelines.train.region import RegionMasks, SceneBox, TrainingRegion, region_masks
+from pipelines.train.solution_state import frozen_exposures
 from pipelines.train.surface import SceneSurface
 from pipelines.train.trainer import JointTrainer, make_trainer
 
@@ -42,29 +42,36 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     """Train the block, and return its figures; errors as of `train.stage.run`, or too few photographs show it."""
     backend, workspace = rasterizer(options.backend, mip_filter=options.mip_filter), stage.workspace
     block = load_json(BlockPlan, workspace.path(BLOCK_PLAN)).block(options.id)
-    whole = AdjustedScene.load(workspace, SOLUTION)
-    box = SceneBox.around(whole.scene.point_in_model)
-    index = whole.scene.sparse.image_index()
+    solution, survey, whole = load_adjusted_scene(workspace, SOLUTION)
+    box = SceneBox.around(whole.point_in_model)
+    index = whole.sparse.image_index()
     rows = np.array([index[name] for name in block.cameras if name in index], dtype=np.int64)
     if len(rows) < _LEAST_VIEWS:
         raise DegenerateGeometryError(
             "block-unseen",
             f"Block {block.id} is seen by {len(rows)} photographs only: reduce --blocks.",
         )
-    solved = whole.of_images(rows)
-    options = options.model_copy(update={"max_gaussians": block.gaussians, "optimize_cameras": False})
-    images = photographs(solved.scene.sparse, solved.survey, workspace, options.effort.max_image_size)
+    solution, scene = solution.of_images(rows), whole.of_images(rows)
+    options = options.model_copy(update={"max_gaussians": block.gaussians, "georeference": "frozen"})
+    images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     scaffold = read_gaussians(workspace.path(SCAFFOLD)).to(backend.device)
     size = training_size(options, len(images), images.largest(), beside=len(scaffold))
     require_memory(size, free_memory_bytes(backend.device))
     images.build(stage.progress)
     maps = None
     if options.dense:
-        maps = DepthMaps(workspace.cache / "surface", solved.scene, images)
+        maps = DepthMaps(workspace.cache / "surface", scene, images)
         maps.build(stage.progress)
-    train = solved.scene.train
     masks = region_masks(
-        solved, train, images, backend, block.region, stand_in=scaffold, maps=maps, progress=stage.progress
+        solution,
+        scene.sparse,
+        scene.train,
+        images,
+        backend,
+        cell=block.region,
+        stand_in=scaffold,
+        maps=maps,
+        progress=stage.progress,
     )
     seeing = masks.seeing
     if len(seeing) < _LEAST_VIEWS:
@@ -73,11 +80,11 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
             f"The surface of block {block.id} is seen by {len(seeing)} photographs only: reduce --blocks.",
         )
     surface = None if maps is None else SceneSurface(maps)
-    scene, region = replace(solved.scene, train=seeing), _region(block, box, scaffold, masks)
-    area = boundary_area(options, scene.geo_from_model.apply(whole.scene.point_in_model), solved.survey.origin)
-    training = TrainingScene(scene, images, surface, region, area)
-    exposures = solved.exposures(backend.device)
-    trainer = make_trainer(training, frozen_problem(solved), backend, options, exposures)
+    region = _region(block, box, scaffold, masks)
+    area = boundary_area(options, scene.geo_from_model.apply(whole.point_in_model), survey.origin)
+    training = TrainingScene(replace(scene, train=seeing), images, surface, region, area)
+    exposures = frozen_exposures(solution, backend.device)
+    trainer = make_trainer(training, frozen_problem(solution, scene), backend, options, exposures)
     earlier = None if stage.extends is None else stage.extends / "record.json"
     done = load_json(BlockTraining, earlier).iterations if earlier is not None and earlier.is_file() else 0
     record = train_in_folder(stage, trainer, options, done)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pipelines.core import stages
 from pipelines.core.files import file_size
-from pipelines.core.products import load_json, save_json
+from pipelines.core.products import save_json
 from pipelines.core.progress import Progress
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Summary
@@ -34,10 +34,10 @@ from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.surface import measured_depth
 from pipelines.survey.block_plan import BlockPlan, BlockRecord, BlockTraining, MergedBlock, PlannedBlock, Seam
 from pipelines.survey.photographs import pinhole_of
-from pipelines.survey.trained_model import Adjustment, TrainedModel
-from pipelines.train.adjusted_scene import figures_of
+from pipelines.survey.solution import Solution, TrainedModel, read_solution
 from pipelines.train.blocks.parts import Parts
 from pipelines.train.schedule import BACKGROUND
+from pipelines.train.solution_state import figures_of
 
 _VIEWS = 4  # in which a seam is measured
 _CANDIDATES = 16  # views from which they are chosen, by small renders
@@ -47,7 +47,7 @@ _SOLID = 0.9  # least alpha of a surface
 _LEAST_PIXELS = 200  # of a seam: fewer tell nothing
 
 
-def compare_neighbours(parts: Parts, plan: BlockPlan, solution: Adjustment, progress: Progress) -> tuple[Seam, ...]:
+def compare_neighbours(parts: Parts, plan: BlockPlan, solution: Solution, progress: Progress) -> tuple[Seam, ...]:
     """Return the disagreement of all neighbouring blocks whose overlap is shown by a view."""
     pairs = [pair for pair in combinations(plan.blocks, 2) if pair[0].region.meets(pair[1].region)]
     if not pairs:
@@ -76,7 +76,7 @@ class SeamViews:
     Memory holds the Gaussians of few blocks at a time.
     """
 
-    def __init__(self, parts: Parts, plan: BlockPlan, solution: Adjustment) -> None:
+    def __init__(self, parts: Parts, plan: BlockPlan, solution: Solution) -> None:
         self._parts, self._plan = parts, plan
         self._backend: Rasterizer = rasterizer(parts.options.backend, mip_filter=parts.options.mip_filter)
         self._device = self._backend.device
@@ -141,7 +141,7 @@ def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress
     # The Gaussians of each cell, adapted to those of its neighbours.
     cells = [parts.variant().root / stages.TRAIN_SEAMS.folder / f"{block.id}.ply" for block in plan.blocks]
     count = join_splat_plys(cells, folder / "gaussians.ply", mip_filter=parts.options.mip_filter)
-    solution = load_json(Adjustment, parts.variant().path(stages.SOLUTION))
+    solution = read_solution(parts.variant(), stages.SOLUTION)
     model = TrainedModel(
         **dict(solution),
         max_image_size=parts.options.effort.max_image_size,

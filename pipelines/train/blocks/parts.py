@@ -20,7 +20,7 @@ from pipelines.survey.block_plan import SCAFFOLD_IMAGE_PX, BlockPlan, BlockRecor
 from pipelines.survey.options import NOT_IN_BLOCKS
 from pipelines.train.options import TrainOptions
 
-FOLDER = "blocks"  # and the command
+FOLDER = "blocks"
 UPSTREAM = stages.stage_slice(None, "init-sim3")
 # The plan applies these, and a block is stale with the plan.
 _OF_PLAN = ("preset", "blocks", "block_overlap", "block_memory")
@@ -57,7 +57,9 @@ class Parts:
         """Return the plan; a MissingProductError: there is none; an InputError: it cannot be read."""
         path = self.variant().root / stages.BLOCK_PLAN
         if not path.is_file():
-            raise MissingProductError(f"{FOLDER}/{stages.BLOCK_PLAN}", f"georef blocks plan {self.workspace.root}")
+            raise MissingProductError(
+                f"{FOLDER}/{stages.BLOCK_PLAN}", f"georef train {self.workspace.root} --part plan"
+            )
         return load_json(BlockPlan, path)
 
     def trainings(self, plan: BlockPlan) -> list[BlockTraining]:
@@ -86,7 +88,7 @@ class Parts:
         for block in self.plan().blocks:
             manifest = self.variant(block.id).manifest(stages.TRAIN_BLOCK)
             if manifest is None:
-                command = f"georef blocks train {self.workspace.root} --id {block.id}"
+                command = f"georef train {self.workspace.root} --part {block.id}"
                 raise MissingProductError(f"{FOLDER}/{block.id}/{stages.BLOCK_GAUSSIANS}", command)
             yield manifest.files[Path(stages.BLOCK_GAUSSIANS).name].sha256
 
@@ -113,14 +115,14 @@ class Parts:
             variant, asked, manifest
         )
 
-    def is_merged(self) -> bool:
-        """Return whether the merged model holds the blocks as they were last trained."""
+    def is_outdated(self) -> bool:
+        """Return whether a block was trained again after the merged model was made."""
         record = self.workspace.root / stages.BLOCK_RECORD
         if not record.is_file():
             return False
         try:
             merged = load_json(BlockRecord, record).blocks
-            return [part.training for part in merged] == self.trainings(self.plan())
+            return [part.training for part in merged] != self.trainings(self.plan())
         except (MissingProductError, InputError):
             return False
 

@@ -119,8 +119,10 @@ def cells_that_fit(
         if len(waiting) + len(done) > MOST_BLOCKS:
             raise DegenerateGeometryError(
                 "too-many-blocks",
-                f"More than {MOST_BLOCKS} blocks would be needed to fit into memory. Reduce --max-gaussians or "
-                "--max-image-size, or use workers with more memory (--block-memory).",
+                f"More than {MOST_BLOCKS} blocks would be needed to fit into memory.",
+                remedy=(
+                    "Reduce --max-gaussians or --max-image-size, or use workers with more memory (--block-memory)."
+                ),
             )
     return done
 
@@ -225,8 +227,11 @@ class _Planner:
         if self._peak_bytes(1) > usable:
             raise ResourceError(
                 "not-enough-memory",
-                f"A block needs at least {self._peak_bytes(1) / 2**30:.1f} GiB of memory, and a worker may use "
-                f"{usable / 2**30:.1f} GiB. Reduce --max-image-size or --crop-size, or raise --block-memory.",
+                (
+                    f"A block needs at least {self._peak_bytes(1) / 2**30:.1f} GiB of memory, and a worker may "
+                    f"use {usable / 2**30:.1f} GiB."
+                ),
+                remedy="Reduce --max-image-size or --crop-size, or raise --block-memory.",
             )
 
         def fits(cell: BlockCell, extent_m: FloatArray) -> bool:

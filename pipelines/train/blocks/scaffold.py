@@ -10,13 +10,13 @@ from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.survey.block_plan import SCAFFOLD_IMAGE_PX, scaffold_gaussians
-from pipelines.survey.scene import photographs
-from pipelines.train.adjusted_scene import AdjustedScene
+from pipelines.survey.scene import load_adjusted_scene, photographs
 from pipelines.train.estimate import training_size
-from pipelines.train.geographic.problem import frozen_problem
+from pipelines.train.georeference.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.loop import train_in_folder
 from pipelines.train.options import TrainOptions
+from pipelines.train.solution_state import frozen_exposures
 from pipelines.train.trainer import make_trainer
 
 _SHARE = 0.5  # of a block's iterations
@@ -26,13 +26,15 @@ _MOST_ITERATIONS, _MOST_LOOKS = 3_000, 10_000
 def run(stage: StageRun, options: TrainOptions) -> Summary:
     """Train the scaffold, and return its key figures; errors are those of `train.stage.run`."""
     backend, workspace = rasterizer(options.backend, mip_filter=options.mip_filter), stage.workspace
-    solved = AdjustedScene.load(workspace, SOLUTION)
-    coarse = coarse_options(options, len(solved.scene.train))
-    images = photographs(solved.scene.sparse, solved.survey, workspace, coarse.effort.max_image_size)
+    solution, survey, scene = load_adjusted_scene(workspace, SOLUTION)
+    coarse = coarse_options(options, len(scene.train))
+    images = photographs(scene.sparse, survey, workspace, coarse.effort.max_image_size)
     require_memory(training_size(coarse, len(images), images.largest()), free_memory_bytes(backend.device))
     images.build(stage.progress)
-    exposures = solved.exposures(backend.device)
-    trainer = make_trainer(TrainingScene(solved.scene, images), frozen_problem(solved), backend, coarse, exposures)
+    exposures = frozen_exposures(solution, backend.device)
+    trainer = make_trainer(
+        TrainingScene(scene, images), frozen_problem(solution, scene), backend, coarse, exposures
+    )
     record = train_in_folder(stage, trainer, coarse)
     gaussians = trainer.optimizer.gaussians.detached()
     write_gaussians(stage.out / "gaussians.ply", gaussians)
@@ -51,7 +53,7 @@ def coarse_options(options: TrainOptions, photographs_count: int) -> TrainOption
             "iterations": max(min(int(_SHARE * effort.iterations), _MOST_ITERATIONS), looks),
             "max_gaussians": scaffold_gaussians(effort.max_gaussians),
             "max_image_size": min(effort.max_image_size, SCAFFOLD_IMAGE_PX),
-            "optimize_cameras": False,
+            "georeference": "frozen",
             "dense": False,
         }
     )

@@ -27,12 +27,13 @@ from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.survey.photographs import ImageCache
-from pipelines.survey.scene import photographs
-from pipelines.train.adjusted_scene import AdjustedScene
-from pipelines.train.geographic.problem import frozen_problem
+from pipelines.survey.scene import Scene, load_adjusted_scene, photographs
+from pipelines.survey.solution import Solution
+from pipelines.train.georeference.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import SeamOptions
 from pipelines.train.region import SceneBox, TrainingRegion, region_masks
+from pipelines.train.solution_state import frozen_exposures
 from pipelines.train.trainer import make_finisher
 
 _SHARE = 0.2  # of a block's iterations, for a strip
@@ -49,8 +50,8 @@ def run(stage: StageRun, options: SeamOptions) -> Summary:
         stage.out / _DONE,
     )
     plan = load_json(BlockPlan, workspace.path(BLOCK_PLAN))
-    solved = AdjustedScene.load(workspace, SOLUTION)
-    images = photographs(solved.scene.sparse, solved.survey, workspace, options.effort.max_image_size)
+    solution, survey, scene = load_adjusted_scene(workspace, SOLUTION)
+    images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     if not stage.resumed or not done.is_file():
         for block in plan.blocks:
             gaussians = read_gaussians(workspace.root / str(block.id) / BLOCK_GAUSSIANS)
@@ -58,7 +59,7 @@ def run(stage: StageRun, options: SeamOptions) -> Summary:
             write_gaussians(_file(stage.out, block.id), gaussians.select(torch.from_numpy(inside)))
         replace_text(done, "0")
     scaffold = read_gaussians(workspace.path(SCAFFOLD))
-    trainer = _SeamTrainer(stage.out, plan, solved, images, scaffold, backend, options)
+    trainer = _SeamTrainer(stage.out, plan, solution, scene, images, scaffold, backend, options)
     seams = list(seams_of(plan))
     with stage.progress.task("seams", len(seams)) as task, deferred_interrupts() as stop:
         for number, (first, second, strip) in enumerate(seams):
@@ -104,7 +105,8 @@ class _SeamTrainer:
 
     folder: Path
     plan: BlockPlan
-    solved: AdjustedScene
+    solution: Solution
+    scene: Scene
     images: ImageCache
     scaffold: Gaussians
     backend: Rasterizer
@@ -140,11 +142,13 @@ class _SeamTrainer:
         """Return the Gaussians of a strip after their training; None if too few views show the strip."""
         if not len(start):
             return None
-        scene, device = self.solved.scene, self.backend.device
+        scene, device = self.scene, self.backend.device
         index = scene.sparse.image_index()
         train = np.array([index[name] for name in names if name in index], dtype=np.int64)
         everything = Gaussians.concatenate([start, surroundings]).to(device)
-        masks = region_masks(self.solved, train, self.images, self.backend, strip, stand_in=everything)
+        masks = region_masks(
+            self.solution, scene.sparse, train, self.images, self.backend, cell=strip, stand_in=everything
+        )
         seeing = masks.seeing
         if len(seeing) < _LEAST_VIEWS:
             return None
@@ -154,10 +158,10 @@ class _SeamTrainer:
         trainer = make_finisher(
             TrainingScene(replace(scene, train=seeing), self.images, None, region),
             start.to(device),
-            frozen_problem(self.solved),
+            frozen_problem(self.solution, scene),
             backend=self.backend,
             options=self.options.model_copy(update={"iterations": iterations}),
-            exposures=self.solved.exposures(device),
+            exposures=frozen_exposures(self.solution, device),
         )
         for _ in range(iterations):
             trainer.step()

@@ -5,19 +5,18 @@ Reads the survey, the SfM model and the adjustment. Writes `solution.json`.
 
 from pipelines.core.products import save_json
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.survey.scene import photographs
-from pipelines.train.adjusted_scene import AdjustedScene, with_exposures
+from pipelines.survey.scene import load_adjusted_scene, photographs
 from pipelines.train.options import SolutionOptions
+from pipelines.train.solution_state import with_exposures
 from pipelines.train.track_exposures import exposures_from_tracks
 
 
 def run(stage: StageRun, options: SolutionOptions) -> Summary:
     """Write the solution, and return its key figures; raises a `GeorefError` if something cannot be read."""
     workspace = stage.workspace
-    adjusted = AdjustedScene.load(workspace)
-    solution, scene = adjusted.adjustment, adjusted.scene
+    solution, survey, scene = load_adjusted_scene(workspace)
     if options.exposure:
-        images = photographs(scene.sparse, adjusted.survey, workspace, options.max_image_size)
+        images = photographs(scene.sparse, survey, workspace, options.max_image_size)
         images.build(stage.progress)
         solution = with_exposures(solution, exposures_from_tracks(scene, images, stage.progress))
     save_json(solution, stage.out / "solution.json")

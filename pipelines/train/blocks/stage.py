@@ -8,7 +8,7 @@ ones continue from their checkpoints.
 import logging
 from collections.abc import Callable, Sequence
 
-from pipelines.core.errors import GeorefError, MissingProductError
+from pipelines.core.errors import GeorefError
 from pipelines.core.options import CONFIG_FILE, REQUESTS
 from pipelines.core.progress import Progress
 from pipelines.core.stages import PLAN_BLOCKS, SOLVE, TRAIN_BLOCK, TRAIN_SCAFFOLD, TRAIN_SEAMS
@@ -29,7 +29,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     plan = train_blocks(parts, stage.progress, force=force, note=note)
     if force or parts.why_missing(TRAIN_SEAMS):
         largest = max(block.peak_bytes for block in plan.blocks)
-        _run_jobs("seams", [_job(parts, "seams", ("seams",), largest, force=force)], stage.progress, note)
+        _run_jobs("seams", [_job(parts, "seams", "seams", largest, force=force)], stage.progress, note)
     return merge_blocks(parts, plan, stage.out, stage.progress)
 
 
@@ -51,9 +51,9 @@ def train_blocks(
     log.info("train: %d blocks", len(plan.blocks))
     if force or parts.why_missing(TRAIN_SCAFFOLD):
         least = min(block.peak_bytes for block in plan.blocks)
-        _run_jobs("scaffold", [_job(parts, "scaffold", ("scaffold",), least, force=force)], progress, note)
+        _run_jobs("scaffold", [_job(parts, "scaffold", "scaffold", least, force=force)], progress, note)
     jobs = [
-        _job(parts, f"block {block.id}", ("train", "--id", str(block.id)), block.peak_bytes, force=force)
+        _job(parts, f"block {block.id}", str(block.id), block.peak_bytes, force=force)
         for block in sorted(plan.blocks, key=lambda block: -block.gaussians)  # the largest first
         if force or parts.why_missing(TRAIN_BLOCK, block.id)
     ]
@@ -61,30 +61,21 @@ def train_blocks(
     return plan
 
 
-def require_trained(parts: Parts, plan: BlockPlan) -> None:
-    """Refuse to merge blocks that are not current: a MissingProductError names the first, and how to train it."""
-    for block in plan.blocks:
-        if parts.why_missing(TRAIN_BLOCK, block.id):
-            command = f"georef blocks train {parts.workspace.root} --id {block.id}"
-            raise MissingProductError(f"blocks/{block.id}", command)
-
-
-def _job(parts: Parts, name: str, arguments: tuple[str, ...], peak_bytes: int, *, force: bool) -> Job:
-    """Return a job of `georef blocks`, whose last argument is the folder of its product in `blocks/`."""
+def _job(parts: Parts, name: str, part: str, peak_bytes: int, *, force: bool) -> Job:
+    """Return a job of `georef train --part`; a part is named as the folder of its product in `blocks/`."""
     root, shared = parts.workspace.root.absolute(), parts.variant().root.absolute()
-    (action, *more), place = arguments, arguments[-1]
     read = [root / name for name in (*(spec.folder for spec in UPSTREAM), REQUESTS, CONFIG_FILE)]
     read += [shared / spec.folder for spec in (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD)]
-    if place == TRAIN_SEAMS.folder:
+    if part == TRAIN_SEAMS.folder:
         read += [shared / str(block.id) for block in parts.plan().blocks]
     return Job(
         name,
-        ("blocks", action, str(root), *more, *(("--force",) if force else ())),
+        ("train", str(root), "--part", part, *(("--force",) if force else ())),
         peak_bytes,
         uses_gpu=parts.on_gpu(),
         folder=root,
-        writes=shared / place,
-        reads=tuple(path for path in read if path.exists() and path != shared / place),
+        writes=shared / part,
+        reads=tuple(path for path in read if path.exists() and path != shared / part),
     )
 
 
@@ -102,5 +93,6 @@ def _run_jobs(title: str, jobs: Sequence[Job], progress: Progress, note: Callabl
         reasons = "; ".join(f"{end.job.name}: {end.error}" for end in failed)
         raise GeorefError(
             "blocks-failed",
-            f"{len(failed)} of {len(jobs)} {title} failed ({reasons}). Run the same command again to train them.",
+            f"{len(failed)} of {len(jobs)} {title} failed ({reasons}).",
+            remedy="Run the same command again to train them.",
         )

@@ -16,15 +16,18 @@ from plyfile import PlyData
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, REPORT
 from pipelines.core.workspace import Workspace
+from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.gaussians import read_gaussians, write_gaussians
 from pipelines.surface import measured_area
 from pipelines.surface.measured_area import area_of
 from pipelines.survey.area import Area
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.measured_ground import MeasuredGround
 from pipelines.survey.options import CrsOptions, FilledAreaOptions
 from pipelines.survey.report import read_report
+from pipelines.survey.solution import Solution, read_sfm, read_solution
+from pipelines.survey.survey import Survey
 from pipelines.survey.target_crs import target_crs
-from pipelines.survey.trained_survey import load_trained
 from tests.deliver.raster.test_raster import GEO_FROM_MODEL, GSD, UTM, write_trained
 from tests.refusals import logged_codes
 
@@ -42,9 +45,14 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     return made
 
 
+def _solved(workspace: Workspace) -> tuple[Workspace, Solution, SparseModel, Survey]:
+    solution = read_solution(workspace)
+    return workspace, solution, read_sfm(workspace, solution), load_survey(workspace)
+
+
 def area(workspace: Workspace, fill: float | str | None = None) -> Area:
     options = FilledAreaOptions.model_validate({"fill": fill})
-    return area_of(options, load_trained(workspace), workspace)
+    return area_of(options, *_solved(workspace))
 
 
 def test_area_is_what_the_views_measure(workspace: Workspace) -> None:
@@ -84,7 +92,7 @@ def test_a_scrap_is_no_area(
 ) -> None:
     """A hundredth of the ground by chance, as after a training of a few steps, is not what a user wants to see."""
     seen = area(workspace, "all")
-    ground = measured_area.measured_ground(load_trained(workspace), workspace)
+    ground = measured_area.measured_ground(*_solved(workspace))
     rows, columns = np.indices(ground.measured.shape)
     middle = shapely.centroid(seen.polygon)
     place = ground.corner + ground.size_m[0] * np.stack([columns, rows], axis=-1)
@@ -113,7 +121,7 @@ def test_every_product_ends_at_the_same_area(workspace: Workspace) -> None:
         "export-ply": {"crop": True},
     }
     values = {name: run_stage(workspace, BY_NAME[name], options).manifest.values for name, options in made.items()}
-    found, survey = area(workspace), load_trained(workspace).survey
+    found, survey = area(workspace), load_survey(workspace)
     target = target_crs(CrsOptions(crs=UTM), survey.origin, np.zeros((1, 3)), survey.vertical)
     polygon = found.in_crs(target)
     report = read_report(workspace.path(REPORT))

@@ -23,7 +23,7 @@ from pipelines.adjust.options import GeolocateOptions
 from pipelines.core.errors import InputError
 from pipelines.core.products import load_json, save_json, save_npz
 from pipelines.core.runner import run_stage
-from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS, SIM3
+from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.raster_whole import INTERPOLATED, MEASURED
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
@@ -36,15 +36,14 @@ from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
 from pipelines.surface.measured_area import area_of
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.options import FilledAreaOptions
-from pipelines.survey.trained_model import TrainedCamera, TrainedModel
-from pipelines.survey.trained_survey import load_trained
+from pipelines.survey.solution import SolvedCamera, TrainedModel, read_sfm, read_solution
 from tests.refusals import codes, refused
 from tests.scenes import (
     Measured,
     Noise,
     TrueScene,
-    initial_product,
     looking_at,
     sparse_model,
     survey_of,
@@ -110,7 +109,7 @@ def write_trained(root: Path) -> Workspace:
     survey, sparse = survey_of(scene, noise, Measured(), rng), sparse_model(scene, noise, rng)
     workspace = write_workspace(root, survey, sparse)
     cameras = tuple(
-        TrainedCamera(
+        SolvedCamera(
             name=name,
             split="train",
             quat_xyzw=tuple(quat_xyzw_from_matrix(rotation).tolist()),
@@ -120,9 +119,6 @@ def write_trained(root: Path) -> Workspace:
             sparse.image_name, sparse.rotation_cam_from_local, sparse.translation_cam_from_local, strict=True
         )
     )
-    covariance = np.diag([1e-3, 1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.03]) ** 2
-    record = GEO_FROM_MODEL.to_record("local", "geo", covariance=covariance)
-    save_json(initial_product(record), root / SIM3)
     save_npz(root / POINTS, vars(geolocate(survey, sparse, GeolocateOptions()).points))
     save_json(trained_model(GEO_FROM_MODEL, max_image_size=192, cameras=cameras), root / MODEL)
     write_gaussians(root / GAUSSIANS, transformed(surface_gaussians(), GEO_FROM_MODEL.inverse()))
@@ -294,8 +290,9 @@ def test_rasters_are_whole_inside_the_area_and_empty_outside(workspace: Workspac
     with rasterio.open(workspace.path("raster/orthophoto.tif")) as raster:
         np.testing.assert_array_equal(raster.read(4) > 0, known)
     np.testing.assert_array_equal(mask > 0, known)
-    trained = load_trained(workspace)
-    area = area_of(FilledAreaOptions(fill="all"), trained, workspace)
+    solution, survey = read_solution(workspace), load_survey(workspace)
+    sfm = read_sfm(workspace, solution)
+    area = area_of(FilledAreaOptions(fill="all"), workspace, solution, sfm, survey)
     assert known.sum() * cell_m2 == pytest.approx(1e4 * area.hectares, rel=0.01)
     # Corners lie beyond the images of all but two cameras, and most of what three see is measured.
     assert known.mean() < 0.95

@@ -14,13 +14,12 @@ import torch
 from georef_cli import boundary
 from georef_cli.main import cli
 from pipelines.core.products import load_json
-from pipelines.core.stages import BLOCK_GAUSSIANS, BLOCK_PLAN, BLOCK_RECORD, GAUSSIANS, MODEL
+from pipelines.core.stages import BLOCK_GAUSSIANS, BLOCK_PLAN, BLOCK_RECORD, BLOCK_TRAINING, GAUSSIANS, MODEL
 from pipelines.core.staleness import status
 from pipelines.core.workspace import Workspace
 from pipelines.splat.gaussians import read_gaussians
-from pipelines.survey.block_plan import BlockPlan, BlockRecord
-from pipelines.survey.trained_model import TrainedModel
-from pipelines.survey.trained_survey import load_trained
+from pipelines.survey.block_plan import BlockPlan, BlockRecord, BlockTraining
+from pipelines.survey.solution import TrainedModel, read_trained
 from pipelines.train.estimate import estimate_training
 from pipelines.train.options import TrainOptions
 from tests.block_scenes import georef, make_field, write_field
@@ -48,7 +47,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
 @pytest.fixture(scope="module")
 def trained(field: Workspace) -> Iterator[tuple[Workspace, list[str]]]:
     """The field trained in two blocks, and the jobs that did it."""
-    code, jobs = georef("blocks", field.root, "--blocks", 2, *SHORT)
+    code, jobs = georef("train", field.root, "--blocks", 2, *SHORT)
     assert code == 0
     yield field, jobs
 
@@ -58,7 +57,7 @@ def test_lidar_is_refused_before_any_work(
 ) -> None:
     cloud = tmp_path / "cloud.ply"
     cloud.write_bytes(b"ply\n")
-    code, jobs = georef("blocks", "plan", field.root, "--blocks", 2, "--lidar", cloud)
+    code, jobs = georef("train", field.root, "--part", "plan", "--blocks", 2, "--lidar", cloud)
     assert (code, jobs) == (2, [])
     assert "a training in blocks does not use LiDAR" in " ".join(capsys.readouterr().err.split())
     assert estimate_training(9, (96, 72), TrainOptions(blocks=2, lidar=cloud)).refusal
@@ -90,7 +89,7 @@ def test_the_merged_model_shows_the_field(trained: tuple[Workspace, list[str]]) 
     report = json.loads((workspace.root / "evaluate/report.json").read_text())
     # Grey for all would give 11 dB: the colours of the patches lie evenly between 0.1 and 0.9.
     assert report["photometric"]["test"]["psnr"] > 16
-    assert load_trained(workspace).model.max_image_size == 96
+    assert read_trained(workspace).max_image_size == 96
     states = {row.stage: row.state for row in status(workspace)}
     assert (states["train"], states["evaluate"]) == ("current", "current")
 
@@ -108,23 +107,37 @@ def test_neighbours_are_compared(trained: tuple[Workspace, list[str]]) -> None:
 
 def test_nothing_is_done_twice(trained: tuple[Workspace, list[str]]) -> None:
     workspace, _ = trained
-    assert georef("blocks", workspace.root) == (0, [])
-    assert georef("blocks", "train", workspace.root, "--id", 1) == (0, [])
     before = (workspace.root / "blocks/1/block/manifest.json").read_bytes()
-    assert georef("blocks", "train", workspace.root) == (0, [])
+    assert georef("train", workspace.root) == (0, [])
+    assert georef("train", workspace.root, "--part", 1) == (0, [])
+    assert georef("train", workspace.root) == (0, [])
     assert (workspace.root / "blocks/1/block/manifest.json").read_bytes() == before
 
 
 def test_a_missing_block_is_trained_again(trained: tuple[Workspace, list[str]], tmp_path: Path) -> None:
-    """Of all that there is, only the block that is missing; the merged model is then made anew."""
+    """Of all that there is, only the block that is missing, once the merged model is to be made anew."""
     workspace = copy_of(trained[0], tmp_path)
     whole = read_gaussians(workspace.path(GAUSSIANS))
     shutil.rmtree(workspace.root / "blocks/0")
-    assert georef("blocks", "merge", workspace.root)[0] == 1
-    code, jobs = georef("blocks", workspace.root)
+    assert georef("train", workspace.root) == (0, [])  # the model is whole without the blocks that it is made of
+    shutil.rmtree(workspace.root / "train")
+    code, jobs = georef("train", workspace.root)
     assert (code, jobs) == (0, ["block 0"])  # its Gaussians are the same: the seams are still current
     again = read_gaussians(workspace.path(GAUSSIANS))
     np.testing.assert_array_equal(again.means.numpy(), whole.means.numpy())
+
+
+def test_a_block_that_was_trained_again_is_merged_anew(
+    trained: tuple[Workspace, list[str]], tmp_path: Path
+) -> None:
+    workspace = copy_of(trained[0], tmp_path)
+    before = load_json(BlockRecord, workspace.path(BLOCK_RECORD)).blocks[1].training
+    assert georef("train", workspace.root, "--part", 1, "--force") == (0, [])
+    again = load_json(BlockTraining, workspace.root / "blocks/1" / BLOCK_TRAINING)
+    assert again != before  # another duration at least
+    assert georef("train", workspace.root)[0] == 0
+    assert load_json(BlockRecord, workspace.path(BLOCK_RECORD)).blocks[1].training == again
+    assert georef("train", workspace.root) == (0, [])
 
 
 def test_an_interrupted_block_goes_on(trained: tuple[Workspace, list[str]], tmp_path: Path) -> None:
@@ -135,18 +148,19 @@ def test_an_interrupted_block_goes_on(trained: tuple[Workspace, list[str]], tmp_
     shutil.rmtree(block)
     with single_thread(), pytest.MonkeyPatch.context() as patch:
         stop_after(patch, 45)
-        assert boundary.guarded(cli, ["blocks", "train", str(workspace.root), "--id", "1", "--quiet"]) == 130
+        assert boundary.guarded(cli, ["train", str(workspace.root), "--part", "1", "--quiet"]) == 130
     partial = workspace.root / "blocks/1/block.partial"
     assert (partial / "progress.txt").read_text().startswith("45 of 60 iterations")
-    assert georef("blocks", "train", workspace.root, "--id", 1)[0] == 0
+    assert georef("train", workspace.root, "--part", 1)[0] == 0
     found = read_gaussians(block / "gaussians.ply")
     for name, values in expected.tensors().items():
         torch.testing.assert_close(found.tensors()[name], values, rtol=0, atol=0)
 
 
 def test_a_block_that_is_not_planned(trained: tuple[Workspace, list[str]]) -> None:
-    assert georef("blocks", "train", trained[0].root, "--id", 9)[0] == 2
-    assert georef("blocks", "sow", trained[0].root)[0] == 2
+    assert georef("train", trained[0].root, "--part", 9)[0] == 2
+    assert georef("train", trained[0].root, "--part", "sow")[0] == 2
+    assert georef("train", trained[0].root, "--part", 1, "--iterations", 10)[0] == 2  # the plan takes options
 
 
 def copy_of(workspace: Workspace, folder: Path) -> Workspace:

@@ -1,0 +1,320 @@
+"""Matches of photographs that stay out, sought where positions, attitudes and the model's depth predict them.
+
+Plain matching compares a feature with all those of the other photograph. On rows of plants or roofs none is unique,
+and of a photograph from far below the others, few are. Where the model is placed on Earth, fixes and attitudes
+predict the camera of a photograph outside it; the photographs inside tell how far such a prediction is off.
+
+1. A feature of a photograph of the model has the depth of the points around it. Its place, size and turn in the
+   photograph outside follow.
+2. Features are compared with those that lie within three σ of that place and agree with size and turn. The ratio
+   test, a looser one, asks each to be unique among these alone, in both photographs.
+3. The matches are verified like all others, together with those known before.
+"""
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipelines.core.progress import Progress
+from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.formats.colmap import lens_of_colmap
+from pipelines.geometry.cameras import Camera, bearings, project
+from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw
+from pipelines.geometry.similarity import Similarity
+from pipelines.geometry.statistics import NORMAL_MAD
+from pipelines.sfm.colmap_database import add_matches, copy_database, finish_database, remove_database
+from pipelines.sfm.features import SfmJob, verify_matches
+from pipelines.sfm.parts import placed_by_positions
+from pipelines.survey.survey import Survey
+
+log = logging.getLogger(__name__)
+
+_FEWEST_REGISTERED = 6  # with fix and attitude: they tell the σ of a prediction
+_SIGMAS = 3.0
+_NEAREST = 5  # registered photographs whose errors a prediction shares
+_FEWEST_SEEN = 10  # points of a photograph of the model that the one outside is predicted to show
+_MOST_NEAR = 40  # photographs of the model, the nearest ones, that are asked for it
+_MOST_PARTNERS = 8  # of a photograph: those with most such points
+_MOST_PAIRS = 400  # each takes up to a second
+_POINTS_AROUND = 5  # of the model, that give a feature its depth
+_MOST_FACTOR = 2.0  # of a feature's size over the predicted one
+_MOST_TURN_RAD = 0.5
+_MOST_DISTANCE = 0.8  # of two descriptors of length one
+_RATIO = 0.9  # of the distance of the best over that of the second; of plain matching 0.8
+_SAME_PLACE_PX = 3.0
+_FEWEST_MATCHES = 15  # COLMAP's fewest inliers of a pair
+_LEAST_SIGMA_PX = 3.0
+
+
+@dataclass(frozen=True)
+class _View:
+    """Camera of a photograph in the model's frame: rotation (3, 3) camera ← model and centre (3,)."""
+
+    camera: Camera
+    rotation: FloatArray
+    center: FloatArray
+
+    def pixels(self, point: FloatArray) -> FloatArray:
+        return project(self.camera, (point - self.center) @ self.rotation.T)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Photograph of a model: its camera, and pixels (N, 2) and places (N, 3) of the points that it shows."""
+
+    view: _View
+    xy_px: FloatArray
+    point: FloatArray
+
+
+@dataclass(frozen=True)
+class _Features:
+    """N features: pixels (N, 2), size and direction as vectors (N, 2) in px, descriptors (N, D) of length one."""
+
+    xy_px: FloatArray
+    axis_px: FloatArray
+    descriptor: FloatArray
+
+
+@dataclass(frozen=True)
+class _Prediction:
+    """Where cameras are, by fix and attitude: place geo ← model, errors of the registered, and σ.
+
+    `fixes` (K, 3) and `error` (K, 3) are in geo, `boresight` is a rotation vector in each camera's frame, by its
+    number: lenses of a rig look elsewhere.
+    """
+
+    place: Similarity
+    fixes: FloatArray
+    error: FloatArray
+    boresight: dict[int, FloatArray]
+    sigma_m: float
+    sigma_rad: float
+
+
+def add_predicted(colmap: Any, job: SfmJob, model: Any, progress: Progress) -> int:
+    """Add predicted matches of the photographs outside a model to those in the database, and verify them.
+
+    Returns:
+        The number of pairs that have got matches; 0 where positions and attitudes predict nothing.
+    """
+    prediction = _prediction(model, job.survey)
+    if prediction is None:
+        return 0
+    outside = _outside(model, job.survey, prediction)
+    inside = {key: _shown(model, key) for key in sorted(model.reg_image_ids())}
+    matches: dict[tuple[int, int], IntArray] = {}
+    pairs = 0
+    with colmap.Database.open(job.database) as opened, progress.task("predicted matches", len(outside)) as task:
+        for key, view in outside.items():
+            features = _features(opened, key)
+            for other in _partners(view, inside, prediction)[: _MOST_PAIRS - pairs]:
+                theirs = _features(opened, other)
+                rows = _matched(features, theirs, _predicted(theirs, inside[other], view, prediction))
+                if len(rows) >= _FEWEST_MATCHES:
+                    pair = (min(key, other) - 1, max(key, other) - 1)
+                    matches[pair] = rows if key < other else rows[:, ::-1]
+                pairs += 1
+            task.advance()
+    if matches:
+        draft = job.database.with_name("predicted.db")
+        remove_database(draft)
+        copy_database(job.database, draft)
+        add_matches(colmap, draft, matches)
+        verify_matches(colmap, replace(job, database=draft), np.array(sorted(matches), dtype=np.int64), progress)
+        finish_database(draft, job.database)
+        remove_database(draft)
+    return len(matches)
+
+
+def _prediction(model: Any, survey: Survey) -> _Prediction | None:
+    """Return how fixes and attitudes predict cameras of a model; None: they do not place it, or are too few."""
+    measured = {image.name: image for image in survey.images}
+    place = placed_by_positions(model, measured)
+    if isinstance(place, str):
+        return None
+    fixes, error, turns, cameras = [], [], [], []
+    for key in sorted(model.reg_image_ids()):
+        image = model.images[key]
+        fix, attitude = measured[image.name].fix, measured[image.name].attitude
+        if fix is None or attitude is None:
+            continue
+        fixes.append(fix.position_in_geo)
+        error.append(place.apply(image.projection_center()[None])[0] - fix.position_in_geo)
+        geo_from_cam = place.rotation @ image.cam_from_world().rotation.matrix().T
+        cameras.append(image.camera_id)
+        turns.append(log_so3(matrix_from_quat_xyzw(attitude.quat_xyzw).T @ geo_from_cam))
+    if len(fixes) < _FEWEST_REGISTERED:
+        return None
+    at, off, turned, camera = (np.array(column) for column in (fixes, error, turns, cameras))
+    boresight = {int(key): np.median(turned[camera == key], axis=0) for key in np.unique(camera)}
+    turned -= np.array([boresight[key] for key in camera.tolist()])
+    rows = range(len(at))
+    near = [_error_near(at[row], np.delete(at, row, axis=0), np.delete(off, row, axis=0)) for row in rows]
+    apart = off - np.array(near)
+    sigma_m, sigma_rad = (NORMAL_MAD * float(np.median(np.abs(each))) for each in (apart, turned))
+    # Fixes near one line leave a tilt of the model about it, which attitudes of one heading take for a boresight.
+    _, width_m, _ = np.linalg.svd(at - at.mean(axis=0), compute_uv=False)  # √N times the extent
+    sigma_rad = float(np.hypot(sigma_rad, sigma_m / max(float(width_m), sigma_m)))
+    return _Prediction(place, at, off, boresight, sigma_m, sigma_rad)
+
+
+def _error_near(position: FloatArray, fixes: FloatArray, error: FloatArray) -> FloatArray:
+    """Return the error (3,) of fixes around a position: neighbours share most of it."""
+    near = np.linalg.norm(fixes - position, axis=1).argsort()[:_NEAREST]
+    return np.asarray(np.median(error[near], axis=0))
+
+
+def _outside(model: Any, survey: Survey, prediction: _Prediction) -> dict[int, _View]:
+    """Return predicted cameras, in the model's frame, of photographs that are not in it, by COLMAP's numbers."""
+    inside = set(model.reg_image_ids())
+    back = prediction.place.inverse()
+    found = {}
+    for key, image in enumerate(survey.images, start=1):
+        if (
+            key in inside
+            or image.fix is None
+            or image.attitude is None
+            or image.camera_id not in prediction.boresight
+        ):
+            continue
+        position = np.array(image.fix.position_in_geo)
+        position = position + _error_near(position, prediction.fixes, prediction.error)
+        geo_from_cam = matrix_from_quat_xyzw(image.attitude.quat_xyzw) @ exp_so3(
+            prediction.boresight[image.camera_id]
+        )
+        rotation = geo_from_cam.T @ prediction.place.rotation
+        found[key] = _View(lens_of_colmap(model.cameras[image.camera_id]), rotation, back.apply(position[None])[0])
+    return found
+
+
+def _shown(model: Any, key: int) -> _Shown:
+    image = model.images[key]
+    view = _View(
+        lens_of_colmap(model.cameras[image.camera_id]),
+        image.cam_from_world().rotation.matrix(),
+        image.projection_center(),
+    )
+    seen = [point for point in image.points2D if point.has_point3D()]
+    xy = np.array([point.xy for point in seen]).reshape(-1, 2)
+    return _Shown(view, xy, np.array([model.points3D[point.point3D_id].xyz for point in seen]).reshape(-1, 3))
+
+
+def _partners(view: _View, inside: dict[int, _Shown], prediction: _Prediction) -> list[int]:
+    """Return the photographs of the model that show most points that a camera is predicted to show."""
+    size = np.array([view.camera.width, view.camera.height])
+    near = sorted(inside, key=lambda key: float(np.linalg.norm(inside[key].view.center - view.center)))
+    count = {}
+    for key in near[:_MOST_NEAR]:
+        point = inside[key].point
+        xy, away = view.pixels(point), np.linalg.norm(point - view.center, axis=1)
+        margin = _SIGMAS * _sigma_px(view, away, prediction)[:, None]
+        with np.errstate(invalid="ignore"):
+            count[key] = int(((xy > -margin) & (xy < size + margin)).all(axis=1).sum())
+    most = sorted(count, key=lambda key: -count[key])[:_MOST_PARTNERS]
+    return [key for key in most if count[key] >= _FEWEST_SEEN]
+
+
+def _sigma_px(view: _View, away: FloatArray, prediction: _Prediction) -> FloatArray:
+    """Return σ (N,) of the places of points at distances (N,) in a predicted camera."""
+    sigma_rad = np.hypot(prediction.sigma_m / (prediction.place.scale * away), prediction.sigma_rad)
+    return np.asarray(view.camera.mean_focal_px * sigma_rad)
+
+
+def _features(database: Any, key: int) -> _Features:
+    """Return the features of a photograph that have descriptors, which come first."""
+    descriptor = np.asarray(database.read_descriptors(key).data, dtype=np.float64)
+    keypoint = np.asarray(database.read_keypoints(key), dtype=np.float64)[: len(descriptor)]
+    if keypoint.ndim != 2 or keypoint.shape[1] < 4 or not len(keypoint):  # a photograph without features, or shapes
+        return _Features(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 1)))
+    if keypoint.shape[1] == 6:  # an affine shape: its first column is the feature's axis
+        axis = keypoint[:, [2, 4]]
+    else:
+        axis = keypoint[:, 2:3] * np.stack([np.cos(keypoint[:, 3]), np.sin(keypoint[:, 3])], axis=1)
+    length = np.maximum(np.linalg.norm(descriptor, axis=1, keepdims=True), 1e-12)
+    return _Features(keypoint[:, :2], axis, descriptor / length)
+
+
+@dataclass(frozen=True)
+class _Where:
+    """Where the N features of a photograph are predicted in another one: pixels, radii and axes (N, 2); if seen."""
+
+    xy_px: FloatArray
+    radius_px: FloatArray  # (N,)
+    axis_px: FloatArray
+    seen: BoolArray  # (N,)
+
+
+def _predicted(features: _Features, shown: _Shown, other: _View, prediction: _Prediction) -> _Where:
+    view, tree = shown.view, cKDTree(shown.xy_px)
+    distance = np.linalg.norm(shown.point - view.center, axis=1)
+    around = distance[tree.query(features.xy_px, k=_POINTS_AROUND)[1]]
+    near, middle, far = np.quantile(around, [0.25, 0.5, 0.75], axis=1)
+
+    def places(ray: FloatArray, reach: FloatArray) -> FloatArray:
+        return view.center + reach[:, None] * (ray @ view.rotation)
+
+    ray, tip_ray = (bearings(view.camera, px) for px in (features.xy_px, features.xy_px + features.axis_px))
+    point = places(ray, middle)
+    xy, tip = other.pixels(point), other.pixels(places(tip_ray, middle))
+    away = np.linalg.norm(point - other.center, axis=1)
+    by_depth = np.linalg.norm(other.pixels(places(ray, far)) - other.pixels(places(ray, near)), axis=1)
+    by_pose = _sigma_px(other, away, prediction)
+    radius = _SIGMAS * np.hypot(np.hypot(by_pose, by_depth), _LEAST_SIGMA_PX)
+    size = np.array([other.camera.width, other.camera.height])
+    known = np.isfinite(xy).all(axis=1) & np.isfinite(tip).all(axis=1) & np.isfinite(radius)
+    with np.errstate(invalid="ignore"):
+        seen = known & (xy > -radius[:, None]).all(axis=1) & (xy < size + radius[:, None]).all(axis=1)
+    return _Where(xy, radius, tip - xy, seen)
+
+
+def _matched(features: _Features, theirs: _Features, where: _Where) -> IntArray:
+    """Return the matches (M, 2) of features with those of another photograph that are predicted among them.
+
+    Each is the best one of the other, and clearly better than the second at another place, among those that the
+    prediction allows.
+    """
+    if not len(features.xy_px) or not where.seen.any():
+        return np.zeros((0, 2), dtype=np.int64)
+    rows = np.flatnonzero(where.seen)
+    tree = cKDTree(features.xy_px)
+    size, turn = np.linalg.norm(features.axis_px, axis=1), _angle(features.axis_px)
+    wanted_size, wanted_turn = np.linalg.norm(where.axis_px, axis=1), _angle(where.axis_px)
+    mine, other, apart = [], [], []
+    for row, near in zip(rows, tree.query_ball_point(where.xy_px[rows], where.radius_px[rows]), strict=True):
+        found = np.array(near, dtype=np.int64)
+        ratio = size[found] / max(wanted_size[row], 1e-9)
+        turned = np.abs((turn[found] - wanted_turn[row] + np.pi) % (2 * np.pi) - np.pi)
+        found = found[(ratio < _MOST_FACTOR) & (ratio > 1 / _MOST_FACTOR) & (turned < _MOST_TURN_RAD)]
+        cosine = features.descriptor[found] @ theirs.descriptor[row]
+        mine.append(found)
+        other.append(np.full(len(found), row))
+        apart.append(np.sqrt(np.maximum(2 - 2 * cosine, 0)))
+    one, two, distance = np.concatenate(mine), np.concatenate(other), np.concatenate(apart)
+    forth = _unique_best(one, two, distance, theirs.xy_px)
+    back = _unique_best(two, one, distance, features.xy_px)
+    kept = forth & back & (distance < _MOST_DISTANCE)
+    return np.stack([one[kept], two[kept]], axis=1)
+
+
+def _unique_best(key: IntArray, value: IntArray, distance: FloatArray, xy_px: FloatArray) -> BoolArray:
+    """Return which candidates (C,), pairs of key and value, are the best of their key, and unique by the ratio.
+
+    `xy_px` are the places of the values: a second one at the place of the best is the same.
+    """
+    chosen = np.zeros(len(key), dtype=bool)
+    order = np.lexsort((distance, key))
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    for begin, end in zip(first, [*first[1:], len(order)], strict=True):
+        best, rest = order[begin], order[begin + 1 : end]
+        beside = np.linalg.norm(xy_px[value[rest]] - xy_px[value[best]], axis=1) > _SAME_PLACE_PX
+        second = distance[rest[beside]].min(initial=np.inf)
+        chosen[best] = distance[best] < _RATIO * second
+    return chosen
+
+
+def _angle(axis: FloatArray) -> FloatArray:
+    return np.asarray(np.arctan2(axis[:, 1], axis[:, 0]))
