@@ -42,6 +42,7 @@ log = logging.getLogger(__name__)
 _FEATURES_BYTES = 2_500_000  # of a photograph in COLMAP's database and model
 # A smaller photograph, its depth map and confidence; the model's depth and colour, and the surface fused from them.
 _TRAINED_PIXEL_BYTES = 17
+_BELIEVED = 0.1  # share of a run's estimated time that weighs for the estimate when done stages correct it
 _GAUSSIAN_BYTES = 59 * 4 * 5  # parameters and both moments in the checkpoint, the model, and the PLY
 
 
@@ -253,8 +254,9 @@ def keep_times(run: RunEstimate | None, outcomes: Sequence[Outcome], before: pac
         log.info("run: others used %.0f %% of this machine: its times are not kept for estimates.", 100 * share)
         return
     whole = {row.stage for row in run.planned if row.action in ("run", "perhaps")}
-    if run.compilation_s:  # beside the one, before the other
-        whole -= {"sfm", "train"}
+    if run.compilation_s:  # Stages after the training compile further kernels, often for longer than they run.
+        names = [row.stage for row in run.planned]
+        whole -= set(names[names.index("train") + 1 :])
     for outcome in outcomes:
         if outcome.ran and outcome.stage in whole:
             pace.learn(outcome.stage, run.modelled.get(outcome.stage), outcome.manifest.duration_s)
@@ -317,14 +319,15 @@ class RunTimeLeft:
     """Time that the remaining stages of a run will take, from their estimated seconds; None: not known.
 
     Stages without an estimate count as nothing: they take seconds. The stages that are done correct the estimates
-    of the others, because one machine is slower than another by a factor.
+    of the others, because one machine is slower than another by a factor: so far as they are much of the run, since
+    a second's stage tells little of an hour's.
     """
 
     def __init__(self, seconds: Mapping[str, float | None], clock: Callable[[], float] = time.monotonic) -> None:
         self._unknown = any(value is None for value in seconds.values())
         self._left = {stage: value for stage, value in seconds.items() if value is not None}
         self._clock, self._began = clock, clock()
-        self._estimated_s = self._took_s = 0.0
+        self._estimated_s = self._took_s = _BELIEVED * sum(self._left.values())
 
     def begin(self) -> None:
         self._began = self._clock()

@@ -1,7 +1,8 @@
 """Correction of the cost model by what this machine's own runs took, kept in the user's cache.
 
 Each run of a stage that was alone on the machine leaves its time over the model's, by processor and threads; the
-median of the last runs corrects the next estimate. A machine whose cores others use teaches nothing, and is named.
+median of the last runs corrects the next estimate; of two the shorter, since the first may have compiled kernels. A
+machine whose cores others use teaches nothing, and is named.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pipelines.core.machine import thread_count, user_cache
 log = logging.getLogger(__name__)
 
 _KEPT = 5  # runs of a stage
+_FEWEST_STAGES = 3  # that ran here, from which on they tell something of the others
 _MOST, _LEAST = 100.0, 0.01  # ratio, beyond which a file is damaged
 _SHORTEST_S = 0.2  # of a run that says something
 _BUSY = 0.25  # share of the cores that others use, from which a machine counts as loaded
@@ -35,9 +37,16 @@ class Ticks:
 
 
 def corrected(stage: str, modelled: float) -> float:
-    """Return the seconds that a stage will take, by what earlier runs of it took on this machine."""
-    ratios = _kept().get(stage, [])
-    return modelled * (statistics.median(ratios) if ratios else 1.0)
+    """Return the seconds that a stage will take, by what earlier runs of it took on this machine.
+
+    A stage that never ran here is taken to be as slow against its model as those that did, in the median: most of
+    what they differ by from the machine of the model is the processor.
+    """
+    kept = _kept()
+    medians = {name: statistics.median_low(ratios) for name, ratios in kept.items() if ratios}
+    if stage in medians:
+        return modelled * medians[stage]
+    return modelled * (statistics.median(medians.values()) if len(medians) >= _FEWEST_STAGES else 1.0)
 
 
 def learn(stage: str, modelled: float | None, took_s: float) -> None:

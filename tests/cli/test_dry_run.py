@@ -68,14 +68,14 @@ def test_a_machine_that_has_to_compile_its_kernels_says_so(
     assert later_s == pytest.approx(totals[1]["compilation_seconds"])
 
 
-def test_times_of_a_run_that_compiled_teach_nothing_of_its_training(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_compiled_teaches_nothing_of_stages_after_the_training(monkeypatch: pytest.MonkeyPatch) -> None:
     taught: list[str] = []
     monkeypatch.setattr(estimate.pace, "learn", lambda stage, *_: taught.append(stage))
     monkeypatch.setattr(estimate.pace, "used_by_others", lambda *_: 0.0)
     names = ("ingest", "sfm", "train", "evaluate")
     planned = [SimpleNamespace(stage=name, action="run") for name in names]
     ran = [SimpleNamespace(stage=name, ran=True, manifest=SimpleNamespace(duration_s=1.0)) for name in names]
-    for compilation_s, expected in ((0.0, list(names)), (45.0, ["ingest", "evaluate"])):
+    for compilation_s, expected in ((0.0, list(names)), (45.0, ["ingest", "sfm", "train"])):
         taught.clear()
         run = SimpleNamespace(planned=planned, modelled={}, compilation_s=compilation_s)
         estimate.keep_times(run, ran, None)  # type: ignore[arg-type]

@@ -34,6 +34,14 @@ def test_the_median_of_the_last_runs_corrects_the_next() -> None:
     assert pace.corrected("train", 200.0) == pytest.approx(100.0)
 
 
+def test_a_stage_that_never_ran_is_as_slow_as_the_others() -> None:
+    pace.learn("ingest", 1.0, 3.0)
+    pace.learn("train", 100.0, 250.0)
+    assert pace.corrected("export-mesh", 10.0) == 10.0  # two stages may both be exceptions
+    pace.learn("evaluate", 10.0, 20.0)
+    assert pace.corrected("export-mesh", 10.0) == pytest.approx(25.0)
+
+
 def test_another_processor_learns_for_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     pace.learn("train", 100.0, 200.0)
     monkeypatch.setattr(pace, "_processor", lambda: "another")
