@@ -9,14 +9,13 @@ from georef_cli.estimate import RunTimeLeft
 
 def test_a_machine_twice_as_slow_doubles_the_rest() -> None:
     now = [0.0]
-    left = RunTimeLeft({"sfm": 60.0, "train": 100.0}, lambda: now[0])
+    left = RunTimeLeft({"sfm": 60.0, "train": 100.0}, lambda: now[0])  # ingest corrects nothing
     assert left.seconds == 160.0
     for stage, took_s in (("ingest", 5.0), ("sfm", 120.0)):
         left.begin()
         now[0] += took_s
         left.end(stage)
-    # A third of the run took twice as long: so will the rest, but for the weight of the estimate. Ingest has none, and
-    # corrects nothing.
+    # A third of the run took twice as long: so will the rest, but for the weight of the estimate.
     assert 170.0 < left.seconds < 200.0
     left.begin()
     left.end("train")
