@@ -49,7 +49,7 @@ def test_a_falsified_survey_is_refused_cautioned_or_right(
         assert wrong_m[1] <= SIGMAS * accuracy["sigma_v_m"] + OWN_M
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(12))  # layouts × receivers, layouts × control
 def test_a_clean_survey_is_right_and_blamed_for_nothing(real_georef: Georef, tmp_path: Path, seed: int) -> None:
     layout, images = (("orbit", 12), ("grid", 16), ("lines", 40), ("circle", 36))[seed % 4]
     fix_m = ((0.02, 0.02, 0.03), (0.05, 0.05, 0.08), (1.5, 1.5, 3.0))[seed % 3]
