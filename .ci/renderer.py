@@ -15,7 +15,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from pipelines.deliver.html_page import RENDERER
+from pipelines.deliver.pages import RENDERER
 from tests.browser.chromium import LIBRARIES
 
 _BUNDLED = ("Three", "Spark", "Fflate")  # Spark's own file holds fflate, which unpacks

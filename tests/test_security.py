@@ -22,8 +22,8 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse, write_sparse
 from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.stage import survey_and_track
-from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.scene import photographs
+from pipelines.survey.solution import GeolocatedPoints
 from pipelines.survey.survey import FixSession, Survey
 from tests.photos import Exif, gps_entries, jpeg, write_flight
 from tests.refusals import numbers, refused, said

@@ -35,7 +35,7 @@ from scipy.spatial import KDTree
 
 from pipelines.core.products import load_json
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.deliver.raster_whole import MEASURED
+from pipelines.deliver.raster_mosaic import MEASURED
 from pipelines.formats.georef_sidecar import CrsSidecar, MeshSidecar, sidecar_path
 from pipelines.geodesy.crs import PointCrs, parse_crs
 from pipelines.geodesy.enu import Origin, ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef

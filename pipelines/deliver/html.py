@@ -19,11 +19,10 @@ from pipelines.core.products import Remark
 from pipelines.core.stages import HTML
 from pipelines.core.types import joined_rows
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.deliver.html_page import splat_page, splat_page_text, write_splat_page
 from pipelines.deliver.options import ExportHtmlOptions
+from pipelines.deliver.pages import Fact, splat_page, splat_page_text, write_splat_page
 from pipelines.deliver.placement import ENU_FROM_Y_UP, Placement
 from pipelines.deliver.splat import codec_arrays, load_splat, splat_values
-from pipelines.deliver.tiles_page import Fact
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.formats.spz import decode_spz, encode_wide_spz
 from pipelines.geometry.cameras import Camera, CameraPoses, Pinhole, pose_matrix

@@ -26,8 +26,7 @@ from pipelines.deliver.options import ExportRasterOptions
 from pipelines.deliver.photo_colours import ColourPictures, PhotoColours
 from pipelines.deliver.placement import median_values, require_space, scene_sigma
 from pipelines.deliver.raster_mosaic import Mosaic
-from pipelines.deliver.raster_plan import make_frame
-from pipelines.deliver.raster_window import RasterSource, raster_source
+from pipelines.deliver.raster_window import RasterSource, make_frame, raster_source
 from pipelines.deliver.surface import without_sigma
 from pipelines.formats.georef_sidecar import CrsSidecar, median_sigma, write_sidecar
 from pipelines.formats.geotiff import RasterFrame, read_reduced

@@ -26,9 +26,9 @@ from pipelines.core.stages import TILES_GLB
 from pipelines.core.types import FloatArray, joined_rows
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.options import Compression, ExportTilesOptions
+from pipelines.deliver.pages import TILESET, ScenePage, scene_page, write_scene_page
 from pipelines.deliver.placement import require_space
 from pipelines.deliver.splat import SplatParts, load_splat_parts, splat_values
-from pipelines.deliver.tiles_page import TILESET, ScenePage, scene_page, write_scene_page
 from pipelines.formats.georef_sidecar import GeorefSidecar, write_sidecar
 from pipelines.formats.gltf import SPLATS, SPZ_IN_GLTF, decode_plain_glb, encode_glb, encode_plain_glb, spz_in_glb
 from pipelines.formats.splat_ply import SplatArrays

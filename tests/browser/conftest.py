@@ -9,9 +9,9 @@ import pytest
 from playwright.sync_api import Browser
 
 from pipelines.deliver.options import Compression
+from pipelines.deliver.pages import write_scene_page
 from pipelines.deliver.splat import codec_arrays
 from pipelines.deliver.tiles import Tiling, write_tiles
-from pipelines.deliver.tiles_page import write_scene_page
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.level_of_detail import DetailTile, scene_box
 from tests.browser import hill

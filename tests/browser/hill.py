@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from pipelines.deliver.options import PageOptions, SplatOptions
+from pipelines.deliver.pages import ScenePage, scene_page
 from pipelines.deliver.placement import solved_placement
 from pipelines.deliver.splat import PlacedSplat, placed_splat
-from pipelines.deliver.tiles_page import ScenePage, scene_page
 from pipelines.geodesy.enu import (
     Origin,
     ecef_from_enu,

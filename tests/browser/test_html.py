@@ -17,8 +17,8 @@ from pipelines.core.products import load_json, save_json
 from pipelines.core.stages import SURVEY
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.deliver.html import run
-from pipelines.deliver.html_page import RENDERER
 from pipelines.deliver.options import ExportHtmlOptions
+from pipelines.deliver.pages import RENDERER
 from pipelines.geometry.cameras import Pinhole, pose_matrix
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from pipelines.deliver.options import CESIUM
-from pipelines.deliver.tiles_page import write_scene_page
+from pipelines.deliver.pages import write_scene_page
 from tests.browser import hill
 from tests.browser.chromium import served
 from tests.browser.conftest import new_viewer, write_scene

@@ -20,8 +20,8 @@ from pipelines.core.stages import GAUSSIANS, MODEL, SAVED_MEASUREMENTS, SURVEY
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.deliver import html
 from pipelines.deliver.html import fitted, run
-from pipelines.deliver.html_page import RENDERER
 from pipelines.deliver.options import ExportHtmlOptions
+from pipelines.deliver.pages import RENDERER
 from pipelines.deliver.placement import ENU_FROM_Y_UP
 from pipelines.formats.georef_sidecar import GeorefSidecar
 from pipelines.formats.spz import decode_spz

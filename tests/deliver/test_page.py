@@ -18,15 +18,15 @@ from pipelines.core.figures import Headline
 from pipelines.core.products import Remark
 from pipelines.core.sentences import printable
 from pipelines.deliver.options import CESIUM, PageOptions, SplatOptions
-from pipelines.deliver.placement import solved_placement
-from pipelines.deliver.splat import placed_splat
-from pipelines.deliver.tiles_page import (
+from pipelines.deliver.pages import (
     LocalCrs,
     ScenePage,
     fit_local_crs,
     scene_page,
     write_scene_page,
 )
+from pipelines.deliver.placement import solved_placement
+from pipelines.deliver.splat import placed_splat
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, ecef_from_lla, lla_from_ecef
 from pipelines.geodesy.vertical import parse_vertical

@@ -25,7 +25,7 @@ from pipelines.core.products import load_json, save_json, save_npz
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, GAUSSIANS, MODEL, POINTS
 from pipelines.core.workspace import Workspace
-from pipelines.deliver.raster_whole import INTERPOLATED, MEASURED
+from pipelines.deliver.raster_mosaic import INTERPOLATED, MEASURED
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.geometry.cameras import Camera, Pinhole
