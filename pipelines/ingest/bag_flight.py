@@ -21,8 +21,7 @@ from pipelines.geodesy.vertical import ELLIPSOIDAL, HEIGHT_REMEDY, VerticalDatum
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import Rig, Trajectory, frame_from_frd
 from pipelines.ingest.bag_messages import BASE, GEODETIC_HEIGHTS, IMPOSSIBLE_HEIGHT
-from pipelines.ingest.bag_photos import lens_priors, write_photos
-from pipelines.ingest.bag_rig import cameras_beside, photographs_beside, sensor_name
+from pipelines.ingest.bag_photos import cameras_beside, lens_priors, photographs_beside, sensor_name, write_photos
 from pipelines.ingest.bag_streams import BagStreams, TopicSamples, read_streams
 from pipelines.ingest.flight_record import (
     RECEIVERS,
