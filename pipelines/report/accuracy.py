@@ -10,7 +10,7 @@ from pipelines.core.stages import ACCURACY_MAP
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.report.page import Picture, picture_of_png, png_file
-from pipelines.report.plots.observations import predicted_against_measured
+from pipelines.report.plots.charts import predicted_against_measured
 from pipelines.survey.report import CheckPointErrors, EvaluationReport, PredictedPointError
 from pipelines.survey.survey import SurveyedPoint
 

@@ -12,7 +12,7 @@ from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, paramet
 from pipelines.geometry.network import Network
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.place import Texts, heads_of, map_coordinates, texts_of
-from pipelines.report.plots.observations import correlation_matrix, fix_series, residual_field
+from pipelines.report.plots.charts import correlation_matrix, fix_series, residual_field
 from pipelines.report.plots.plans import movement_plan
 from pipelines.report.views import reprojection_residuals
 from pipelines.survey.headline import NOTHING_CHECKS

@@ -17,7 +17,6 @@ from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.footprints import PointSurface
 from pipelines.report.cameras import LensesFacts
-from pipelines.report.delivered import measured_share
 from pipelines.report.options import ReportOptions
 from pipelines.report.page import (
     Picture,
@@ -32,6 +31,7 @@ from pipelines.report.page import (
 )
 from pipelines.report.place import OverlapFacts
 from pipelines.report.plots.maps import RasterPlace, raster_map
+from pipelines.report.record import measured_share
 from pipelines.survey.area import ground_sampling_m
 from pipelines.survey.report import EvaluationReport
 from pipelines.survey.survey import Survey

@@ -21,12 +21,19 @@ from pipelines.report.accuracy import accuracy_facts
 from pipelines.report.cameras import CamerasFacts, LensesFacts, cameras_facts, lenses_facts
 from pipelines.report.chromium import chromium_path, print_pdf
 from pipelines.report.cover import cover_facts
-from pipelines.report.delivered import delivered_facts, measured_share
 from pipelines.report.options import ReportOptions
 from pipelines.report.page import Page, Section, moment, render_page
 from pipelines.report.place import OverlapFacts, overlap_facts, place_facts
 from pipelines.report.points import points_facts
-from pipelines.report.record import RecordFacts, change_facts, lidar_facts, record_facts, reference_facts
+from pipelines.report.record import (
+    RecordFacts,
+    change_facts,
+    delivered_facts,
+    lidar_facts,
+    measured_share,
+    record_facts,
+    reference_facts,
+)
 from pipelines.report.verdicts import Measured, Verdict, verdicts
 from pipelines.report.views import adjusted_network, read_evaluated, seen_scene, training_facts, views_facts
 from pipelines.survey.calibrated import load_survey

@@ -18,8 +18,7 @@ from pipelines.geometry.network import Network, has_positive_depth
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.report.page import Picture, limited, picture_of, picture_of_png, read_picture
-from pipelines.report.plots.charts import without_labels
-from pipelines.report.plots.observations import curves
+from pipelines.report.plots.charts import curves, without_labels
 from pipelines.survey.area import LEAST_RAYS, without_outliers
 from pipelines.survey.photographs import DIFFERENCE_GAIN, render_name
 from pipelines.survey.report import EvaluationReport, PhotometricFigures, read_report
