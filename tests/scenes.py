@@ -20,8 +20,7 @@ from pipelines.geometry.cameras import Camera, CameraPoses, project
 from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import SimilarityEstimate
-from pipelines.survey.solution import SolvedCamera, TrainedModel
+from pipelines.survey.solution import SimilarityEstimate, SolvedCamera, TrainedModel
 from pipelines.survey.survey import Attitude, CameraPrior, Fix, FixSession, Mark, Survey, SurveyedPoint, SurveyImage
 
 CAMERA = Camera("OPENCV", 1200, 900, np.array([1020.0, 1018.0, 603.0, 447.0, -0.045, 0.012, 3e-4, -2e-4]))

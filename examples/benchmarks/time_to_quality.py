@@ -37,8 +37,8 @@ from pipelines.evaluate.photometric import compare_test_views
 from pipelines.jobs.machine import inspect_machine
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.scene import load_adjusted_scene, photographs
+from pipelines.survey.solution import GeolocatedPoints
 from pipelines.train.georeference.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions

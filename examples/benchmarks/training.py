@@ -42,10 +42,10 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
-from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.marks import mark_rays, triangulated_points
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import Scene, load_adjusted_scene, photographs
+from pipelines.survey.solution import GeolocatedPoints
 from pipelines.survey.survey import Survey
 from pipelines.train.georeference.problem import frozen_problem, refining_problem
 from pipelines.train.initial_gaussians import TrainingScene

@@ -28,8 +28,8 @@ from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.intersection import CommonRotation, Intersections, Rays, UncertainCameras, intersect_rays
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.calibrated import load_survey
+from pipelines.survey.solution import GeolocatedPoints
 from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)

@@ -65,11 +65,10 @@ from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.similarity import Similarity, SimilarityRecord, jacobian_at, spread_ratio_similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import ResidualStats, residual_stats, squared_mahalanobis
-from pipelines.survey.adjustment import GeolocatedPoints, MeasurementVerdict, SimilarityEstimate
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
 from pipelines.survey.scene import Scene, initial_scene
-from pipelines.survey.solution import Solution
+from pipelines.survey.solution import GeolocatedPoints, MeasurementVerdict, SimilarityEstimate, Solution
 from pipelines.survey.survey import Survey
 
 _DISAGREE = 3.5  # σ by which a distance misses the solution; one in two thousand does by chance

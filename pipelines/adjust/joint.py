@@ -30,7 +30,6 @@ from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import chi2_probability_above, median_chi2, outlier_gate
-from pipelines.survey.adjustment import SimilarityEstimate
 from pipelines.survey.marks import RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.survey.report_parts import (
     EstimatedError,
@@ -41,6 +40,7 @@ from pipelines.survey.report_parts import (
     with_variance_factors,
 )
 from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.solution import SimilarityEstimate
 from pipelines.survey.survey import Survey
 
 _ROUNDS, _SETTLED = 8, 0.02  # of the factors, and their relative change at which they are final

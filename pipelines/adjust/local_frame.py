@@ -23,8 +23,8 @@ from pipelines.core.types import FloatArray
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import residual_stats
-from pipelines.survey.adjustment import SimilarityEstimate
 from pipelines.survey.marks import mark_rays
+from pipelines.survey.solution import SimilarityEstimate
 from pipelines.survey.survey import Survey
 
 Up = Literal["plane", "photographs"]

@@ -39,11 +39,10 @@ from pipelines.geometry.cameras import bearings
 from pipelines.geometry.intersection import NearestPoints
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import MeasurementVerdict
 from pipelines.survey.common_points import CommonPoints
 from pipelines.survey.marks import MarkRays, RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.survey.scene import Scene
-from pipelines.survey.solution import EarlierDate
+from pipelines.survey.solution import EarlierDate, MeasurementVerdict
 from pipelines.survey.survey import Survey
 
 _INCONSISTENT_SIGMAS = 6.0

@@ -18,11 +18,11 @@ from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import MeasurementVerdict
 from pipelines.survey.report import AccuracySummary
 from pipelines.survey.scene import Scene
 from pipelines.survey.solution import (
     Measurement,
+    MeasurementVerdict,
     Solution,
     SolvedCamera,
     SolvedLens,

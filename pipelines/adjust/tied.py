@@ -16,7 +16,7 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import RansacOptions, cauchy_weight, mad_sigma, ransac
-from pipelines.survey.adjustment import SimilarityEstimate
+from pipelines.survey.solution import SimilarityEstimate
 from pipelines.survey.survey import Survey
 
 FEW_COMMON = 30  # points: a lens, and the shape of a block, take more

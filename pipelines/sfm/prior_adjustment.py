@@ -31,8 +31,8 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import residual_stats
 from pipelines.sfm.adjustment import position_adjuster
 from pipelines.sfm.options import AdjustOptions
-from pipelines.survey.adjustment import MeasurementVerdict, SimilarityEstimate
 from pipelines.survey.calibrated import load_survey
+from pipelines.survey.solution import MeasurementVerdict, SimilarityEstimate
 from pipelines.survey.survey import Fix, Survey
 
 _MOST_ITERATIONS = 100

@@ -24,10 +24,9 @@ from pipelines.geometry.network import Network
 from pipelines.geometry.rolling_shutter import depths_at, in_rolling_shutter
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import SimilarityEstimate
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.photographs import ImageCache, Photograph
-from pipelines.survey.solution import Solution, read_solution
+from pipelines.survey.solution import SimilarityEstimate, Solution, read_solution
 from pipelines.survey.survey import Survey
 
 _SHIFT_GRID = (48, 36)  # columns and rows: tie points are not denser

@@ -30,14 +30,13 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader, MeasuredFiles
 from pipelines.surface.photo_depths import DepthStatement, PhotoDepths, holds_depth_maps
-from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.area import boundary_area
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.report_parts import EstimatedError, LidarReport
 from pipelines.survey.scene import Scene, load_adjusted_scene, photographs
-from pipelines.survey.solution import LensVignetting, Solution, TrainedModel
+from pipelines.survey.solution import GeolocatedPoints, LensVignetting, Solution, TrainedModel
 from pipelines.train.compilation import compile_kernels
 from pipelines.train.estimate import estimate_training, training_size, with_effort
 from pipelines.train.georeference.problem import frozen_problem, refining_problem

@@ -16,7 +16,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import BY_NAME, POINTS
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.solution import GeolocatedPoints
 from pipelines.survey.survey import Survey
 from tests.refusals import codes, numbers, refused, said
 from tests.scenes import (

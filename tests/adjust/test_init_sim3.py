@@ -19,8 +19,7 @@ from pipelines.core.stages import ADJUSTMENT, BY_NAME, SIM3
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import GeolocatedPoints, SimilarityEstimate
-from pipelines.survey.solution import Solution
+from pipelines.survey.solution import GeolocatedPoints, SimilarityEstimate, Solution
 from pipelines.survey.survey import Survey
 from tests.refusals import numbers, refused, said
 from tests.scenes import (

@@ -2,7 +2,7 @@
 
 Each run draws image observations, fixes, control points and marks with the σ that they state. The bundle is
 adjusted with its lens, the tool then finds similarity and cameras, and points that no one surveyed are intersected
-from pipelines.survey.adjustment import MeasurementVerdict
+from pipelines.survey.solution import MeasurementVerdict
 from their marks. The bundle is small and its lens is weak (σ of the focal length 0.3 %), so that every part of the
 prediction counts: the similarity, the cameras, the lens, the marks. In a second bundle all cameras are level,
 which leaves the principal point, and with it the heights, to the fixes.
@@ -27,8 +27,8 @@ from pipelines.geometry.intersection import intersection_jacobian
 from pipelines.geometry.network import Network
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.adjustment import MeasurementVerdict
 from pipelines.survey.scene import Scene
+from pipelines.survey.solution import MeasurementVerdict
 from pipelines.survey.survey import Fix, Mark, Survey, SurveyedPoint
 from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, noisy, pixels, readjusted, size
 from tests.drawn_surveys import missed, rows_of

@@ -19,9 +19,9 @@ from pipelines.core.files import read_npz
 from pipelines.core.products import save_npz
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.survey.adjustment import MeasurementVerdict
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.solution import MeasurementVerdict
 from pipelines.survey.survey import Survey
 from tests.drawn_surveys import Receiver, drawn, flight, missed, surveyed
 from tests.refusals import refused

@@ -15,7 +15,7 @@ import torch
 from pipelines.core.products import load_json, save_json, save_npz
 from pipelines.core.stages import ADJUSTMENT, BY_NAME, GAUSSIANS, MODEL, POINTS, REPORT, SPARSE, SURVEY
 from pipelines.geometry.similarity import Similarity
-from pipelines.survey.adjustment import GeolocatedPoints
+from pipelines.survey.solution import GeolocatedPoints
 from pipelines.survey.survey import Survey
 from tests.cli_runs import Georef, products_in, write_files
 from tests.photos import jpeg

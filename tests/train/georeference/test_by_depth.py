@@ -19,8 +19,7 @@ from pipelines.geometry.statistics import CAUCHY_SCALE2
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.reference import render_reference
-from pipelines.train.georeference.beside import DepthMarks
-from pipelines.train.georeference.problem import GeoProblem
+from pipelines.train.georeference.problem import DepthMarks, GeoProblem
 from pipelines.train.georeference.unknowns import SolutionUnknowns
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -20,12 +20,16 @@ from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.system import Problem, cost_at, minimise
 from pipelines.adjust.terms import MarkedTerm, Term
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.scene import Scene, adjusted_scene
-from pipelines.survey.solution import Solution
+from pipelines.survey.solution import GeolocatedPoints, Solution
 from pipelines.survey.survey import Survey
-from pipelines.train.georeference.beside import SURFACE_SIGMA, depth_residuals
-from pipelines.train.georeference.problem import GeoProblem, frozen_problem, refining_problem
+from pipelines.train.georeference.problem import (
+    SURFACE_SIGMA,
+    GeoProblem,
+    depth_residuals,
+    frozen_problem,
+    refining_problem,
+)
 from pipelines.train.options import GeographicOptions, TrainOptions
 from pipelines.train.solution_state import (
     frozen_exposures,
