@@ -113,13 +113,13 @@ def _guarded(
         elif ended is None:
             raise
         else:
-            _say(ended.message)
+            _print_error(ended.message)
         _drop_stdout()
         return FAILED if ended is None else ended.code
     return code if isinstance(code, int) else 0
 
 
-def _say(text: str) -> None:
+def _print_error(text: str) -> None:
     """Print a line on stderr, which may lie on the disk that is full."""
     with contextlib.suppress(OSError):
         click.echo(text, err=True)
@@ -135,7 +135,7 @@ def _drop_stdout() -> None:
 
 def safe_traceback(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
     """Print the traceback of an exception that nobody foresaw, as Python does, but safe for a terminal."""
-    _say(printable_lines("".join(tracebacks.format_exception(kind, error, traceback)).rstrip("\n")))
+    _print_error(printable_lines("".join(tracebacks.format_exception(kind, error, traceback)).rstrip("\n")))
 
 
 @contextmanager

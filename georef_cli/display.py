@@ -78,7 +78,7 @@ def _so_far(task: Task) -> Text:
     return Text("" if task.elapsed is None else f"{clock(task.elapsed)} so far")
 
 
-def _left(task: Task) -> Text:
+def _time_left(task: Task) -> Text:
     """Return the time that is left, by the task's own estimate or the speed of its steps; nothing if unknown."""
     left_s = task.time_remaining if task.fields["left_s"] is None else task.fields["left_s"]
     return Text("" if left_s is None or math.isinf(left_s) or task.finished else f"{clock(left_s)} left")
@@ -127,7 +127,7 @@ class BarProgress:
             MofNCompleteColumn(table_column=TableColumn(no_wrap=True)),
             *([_TextColumn(_speed)] if wide else []),
             _TextColumn(_so_far),
-            _TextColumn(_left),
+            _TextColumn(_time_left),
             # The note is cut off where the line ends.
             _TextColumn(lambda task: Text(task.fields["note"], no_wrap=True, overflow="ellipsis"), no_wrap=False),
         )

@@ -40,7 +40,7 @@ def overview_text(result: Overview) -> list[Renderable]:
         state = f"[{tables.STATE_STYLE.get(file.state, 'dim')}]{file.state}[/]"
         wide.add_row(name, count, tables.when(file.made), state, use)
         narrow.add_row(name, count, state, use)
-    parts: list[Renderable] = [*_headline(result), _place(result), ByWidth(tables.WIDE, wide, narrow)]
+    parts: list[Renderable] = [*_headline(result), _place_table(result), ByWidth(tables.WIDE, wide, narrow)]
     if result.further:
         parts.append("\n[bold]Not made yet[/]")
         parts += [
@@ -66,7 +66,7 @@ def run_summary(result: Overview) -> list[Renderable]:
         **({f"georef run {workspace} --deliver {names}": "further deliverables"} if names else {}),
     }
     steps = [f"  {literal(command)}  [dim]{use}[/]" for command, use in further.items()]
-    parts: list[Renderable] = ["", *_headline(result), _place(result, brief=True)]
+    parts: list[Renderable] = ["", *_headline(result), _place_table(result, brief=True)]
     return [*parts, f"\n[bold]Files[/] in {literal(str(workspace))}", files, "\n[bold]Next[/]", *steps]
 
 
@@ -94,7 +94,7 @@ def _headline(result: Overview) -> list[str]:
     ]
 
 
-def _place(result: Overview, *, brief: bool = False) -> Table:
+def _place_table(result: Overview, *, brief: bool = False) -> Table:
     """Return the lines on the place on Earth and its accuracy."""
     bounds, accuracy = result.bounds, result.accuracy
     lines, on_earth = {}, bounds.on_earth

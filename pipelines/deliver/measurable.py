@@ -89,7 +89,7 @@ def run(stage: StageRun, options: MeasurableOptions) -> Summary:
     replaced, discs = with_discs(shown, surface, geo_from_model, spacing_m)
     refined = refine_appearance(
         replaced,
-        lambda number: _shown(views.view(number)),
+        lambda number: _shown_view(views.view(number)),
         _order(views, surface, geo_from_model, options.appearance_passes),
         renderer.backend,
         RasterSettings(model.sh_degree, model.background),
@@ -225,7 +225,7 @@ def _collected(squares: Iterable[SurfaceCloud], views: SurfaceViews, gaussians: 
     return joined_rows(parts)
 
 
-def _shown(view: SurfaceView) -> ShownView:
+def _shown_view(view: SurfaceView) -> ShownView:
     assert view.rgb is not None
     colour = torch.from_numpy(np.array(view.rgb)).float() / 255
     return ShownView(_pose(view), view.pinhole, colour)

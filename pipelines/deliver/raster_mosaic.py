@@ -61,7 +61,7 @@ class SeenCells:
 
     Attributes:
         frame: of these cells.
-        own: rows and columns of the window among them.
+        in_window: rows and columns of the window among them.
         height: NaN: not measured.
         rgba: (4, H, W); alpha as in `WindowCells`.
         modelled: as in `WindowCells`.
@@ -70,7 +70,7 @@ class SeenCells:
     """
 
     frame: RasterFrame
-    own: tuple[slice, slice]
+    in_window: tuple[slice, slice]
     height: FloatArray
     rgba: ByteArray
     modelled: FloatArray
@@ -102,12 +102,16 @@ def whole_cells(
     source: RasterSource, seen: SeenCells, coarse: CoarseCells, first: tuple[int, int]
 ) -> dict[str, NDArray[Any]]:
     """Return the bands of each raster in a window that begins at a row and column; empty outside the area."""
-    own, target = seen.own, source.target
+    here, target = seen.in_window, source.target
     cells = fill_cells(seen.height, seen.inside, REACH, seen.modelled)
-    blank = seen.rgba[3][own] == 0
-    rgb = np.where(seen.rgba[3] > 0, seen.rgba[:3], seen.rgba[:3].reshape(3, -1)[:, cells.source])[:, *own]
-    measured, inside = np.isfinite(seen.height)[own], seen.inside[own]
-    height, spread, distance = cells.height[own].copy(), cells.sigma[own].copy(), cells.distance[own].copy()
+    blank = seen.rgba[3][here] == 0
+    rgb = np.where(seen.rgba[3] > 0, seen.rgba[:3], seen.rgba[:3].reshape(3, -1)[:, cells.source])[:, *here]
+    measured, inside = np.isfinite(seen.height)[here], seen.inside[here]
+    height, spread, distance = (
+        cells.height[here].copy(),
+        cells.sigma[here].copy(),
+        cells.distance[here].copy(),
+    )
     wide = inside & ~measured & ((distance > _NARROW) | np.isnan(height))
     if wide.any():
         at = coarse.at(first, wide)
@@ -118,12 +122,12 @@ def whole_cells(
         distance[wide] = np.where(fine > 0, distance[wide], coarse.cells.distance[at] * coarse.step)
         rgb[:, wide] = np.where((fine == 0) & blank[wide], coarse.rgb[at].T, rgb[:, wide])
     # The model may know what no view confirms. Where it differs from what lies around, it is wrong one time in ten.
-    modelled = seen.modelled[own]
+    modelled = seen.modelled[here]
     taken = ~measured & np.isfinite(modelled) & np.isfinite(height)
     spread[taken] = np.sqrt(spread[taken] ** 2 + _WRONG * (modelled[taken] - height[taken]) ** 2)
     height[taken] = modelled[taken]
     known = inside & np.isfinite(height)
-    frame = seen.frame.part(own[1].start, own[0].start, known.shape[1], known.shape[0])
+    frame = seen.frame.part(here[1].start, here[0].start, known.shape[1], known.shape[0])
     georeference_h, georeference_v = georeference_sigma_maps(source, frame, np.where(known, height, np.nan))
     # What views do not confirm to a training pixel is known no better than that.
     spread_m = np.hypot(spread * target.crs.height_unit_m, source.training_gsd_m)
@@ -136,8 +140,8 @@ def whole_cells(
     }
     if source.terrain is not None:
         ground, variance_m2 = _ground(source, source.terrain, seen)
-        sigma = np.where(variance_m2[own] > 0, np.sqrt(georeference_v**2 + variance_m2[own]), seen.sigma_v_m)
-        heights |= {"dtm": ground[own], "sigma_dtm": sigma}
+        sigma = np.where(variance_m2[here] > 0, np.sqrt(georeference_v**2 + variance_m2[here]), seen.sigma_v_m)
+        heights |= {"dtm": ground[here], "sigma_dtm": sigma}
     alpha, mask = np.where(known, 255, 0), np.where(measured, MEASURED, INTERPOLATED) * known
     return {
         "orthophoto": (np.concatenate([rgb, alpha[None]]) * known).astype(np.uint8),
@@ -296,10 +300,10 @@ class Mosaic:
         with progress.task(task_name, len(windows)) as task:
             for window in windows:
                 if not all(self._part(self._coloured, name, window).exists() for name in names):
-                    part, own, frame = self._around(window, MARGIN)
+                    part, in_window, frame = self._around(window, MARGIN)
                     height = read_cells(heights, part)[0].astype(np.float64)
                     found = colours.window(frame, (part[0].start, part[1].start), height)
-                    yield window, CellColours(found.colours[:, *own], found.camera[own])
+                    yield window, CellColours(found.colours[:, *in_window], found.camera[in_window])
                 task.advance()
 
     def add_source(self) -> None:
@@ -373,7 +377,7 @@ class Mosaic:
             self._write(self._seen, window, bands)
 
     def _seen_around(self, window: _Window) -> SeenCells:
-        part, own, frame = self._around(window, REACH)
+        part, in_window, frame = self._around(window, REACH)
         sigma_h, sigma_v = (read_cells(self._part(self._seen, name, window))[0] for name in ("sigma_h", "sigma_v"))
         height, inside = (
             read_cells(self._seen / "dsm.vrt", part)[0].astype(np.float64),
@@ -383,7 +387,7 @@ class Mosaic:
             inside &= np.isfinite(height)
         return SeenCells(
             frame=frame,
-            own=own,
+            in_window=in_window,
             height=height,
             rgba=read_cells(self._seen / "orthophoto.vrt", part),
             modelled=read_cells(self._seen / "modelled.vrt", part)[0].astype(np.float64),
@@ -398,12 +402,12 @@ class Mosaic:
         top, left = max(row - margin, 0), max(column - margin, 0)
         rows = min(row + window.frame.rows + margin, self.frame.rows) - top
         columns = min(column + window.frame.columns + margin, self.frame.columns) - left
-        own = (
+        in_window = (
             slice(row - top, row - top + window.frame.rows),
             slice(column - left, column - left + window.frame.columns),
         )
         part = (slice(top, top + rows), slice(left, left + columns))
-        return part, own, self.frame.part(left, top, columns, rows)
+        return part, in_window, self.frame.part(left, top, columns, rows)
 
     @cached_property
     def _coarse(self) -> CoarseCells:

@@ -83,7 +83,7 @@ def inspect_splat(path: Path) -> SplatReport:
     sources = list(_sources(path, data))
     low, high = np.percentile(splat.means, _SHARES, axis=0)
     middle = np.median(splat.means, axis=0)
-    shown_at = [_shown(source, np.stack([middle, low, high]), path) for source in sources]
+    shown_at = [_lla_of_points(source, np.stack([middle, low, high]), path) for source in sources]
     places = tuple(
         StatedPlace(source.name, source.crs, source.epoch, None if lla is None else vector3(lla[0]))
         for source, lla in zip(sources, shown_at, strict=True)
@@ -114,7 +114,7 @@ def _sources(path: Path, data: bytes | None) -> Iterator[_Source]:
             yield _Source(beside.name, sidecar.crs_id, sidecar.epoch, sidecar.ecef_from_file())
 
 
-def _shown(source: _Source, points: FloatArray, path: Path) -> FloatArray | None:
+def _lla_of_points(source: _Source, points: FloatArray, path: Path) -> FloatArray | None:
     """Return latitude, longitude and height (n, 3) of points in the file's axes; None: not known.
 
     No similarity leads to angles.

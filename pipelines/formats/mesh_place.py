@@ -79,7 +79,7 @@ def placed(mesh: TriangleMesh, *, crs_stated: bool, offset_stated: bool, flag: s
     offsets = [one for one in found if one.offset is not None]
     for one in offsets[1:]:
         if not offset_stated and np.abs(_offset(one) - _offset(offsets[0])).max() > _SAME_OFFSET:
-            texts = " and ".join(f"{_shown(_offset(each))} in {each.path.name}" for each in (offsets[0], one))
+            texts = " and ".join(f"{_metres(_offset(each))} in {each.path.name}" for each in (offsets[0], one))
             message = f"Two files beside the mesh state different offsets: {texts}."
             remedy = f"Give {flag}-offset."
             raise InputError("mesh-offsets-differ", message, path=path, field=flag, remedy=remedy)
@@ -89,13 +89,13 @@ def placed(mesh: TriangleMesh, *, crs_stated: bool, offset_stated: bool, flag: s
         name, middle = offsets[0].path.name, np.median(vertices, axis=0)
         if np.linalg.norm((middle - shift)[:2]) < np.linalg.norm(middle[:2]):
             sentence = (
-                f"{path.name}: the offset {_shown(shift)} of {name} was not added, since the vertices lie around "
-                f"{_shown(middle)} already."
+                f"{path.name}: the offset {_metres(shift)} of {name} was not added, since the vertices lie around "
+                f"{_metres(middle)} already."
             )
             remarks.append(Remark(code=f"{flag.removeprefix('--')}-offset-included", sentence=sentence))
             shift = np.zeros(3)
         else:
-            sentence = f"{path.name}: the offset {_shown(shift)} of {name} was added to its vertices."
+            sentence = f"{path.name}: the offset {_metres(shift)} of {name} was added to its vertices."
             remarks.append(Remark(code=f"{flag.removeprefix('--')}-offset-added", sentence=sentence))
     if enu is not None and not crs_stated:
         return PlacedVertices(ecef_from_enu(vertices + shift, enu), FileCrs(wkt=ECEF), tuple(remarks))
@@ -196,7 +196,7 @@ def _offset(one: PlaceFile) -> FloatArray:
     return np.zeros(3) if one.offset is None else one.offset
 
 
-def _shown(values: FloatArray) -> str:
+def _metres(values: FloatArray) -> str:
     return ", ".join(f"{value:.3f}" for value in values)
 
 

@@ -153,15 +153,15 @@ class _Placing:
         if self._option.horizontal and file.horizontal and self._differ(self._option, file):
             self._remark(
                 "crs-overrules",
-                f"{self._path.name}: the stated CRS, {_shown(self._option)}, overrules the CRS of the file's "
-                f"{file.source}, {_shown(file)}.",
+                f"{self._path.name}: the stated CRS, {_crs_text(self._option)}, overrules the CRS of the file's "
+                f"{file.source}, {_crs_text(file)}.",
             )
         others = [one for one in self._sources if one.horizontal and one is not file]
         if not self._option.horizontal and others and self._differ(file, others[0]):
             self._remark(
                 "crs-disagrees",
-                f"{self._path.name}: its {file.source} state {_shown(file)}, its {others[0].source} "
-                f"{_shown(others[0])}. The header's WKT bit has the {file.source} count.",
+                f"{self._path.name}: its {file.source} state {_crs_text(file)}, its {others[0].source} "
+                f"{_crs_text(others[0])}. The header's WKT bit has the {file.source} count.",
                 f"{self._flag}-crs overrules both.",
             )
 
@@ -169,7 +169,7 @@ class _Placing:
         """Return whether two statements place the middle of the cloud differently."""
         if one.horizontal == other.horizontal and one.plan_unit == other.plan_unit:
             return False
-        places = [self._place(statement) for statement in (one, other)]
+        places = [self._middle_in_lla(statement) for statement in (one, other)]
         if places[0] is None or places[1] is None:
             try:
                 first, second = CRS.from_user_input(one.horizontal), CRS.from_user_input(other.horizontal)
@@ -180,7 +180,7 @@ class _Placing:
             return not same or (places[0] is None) != (places[1] is None)
         return float(np.linalg.norm(places[0] - places[1])) > _SAME_PLACE_M
 
-    def _place(self, statement: _Statement) -> FloatArray | None:
+    def _middle_in_lla(self, statement: _Statement) -> FloatArray | None:
         if self._middle is None:
             return None
         try:
@@ -435,7 +435,7 @@ def _same_upright(one: CRS, other: CRS) -> bool:
     return one.equals(other) or (one.datum is not None and other.datum is not None and one.datum == other.datum)
 
 
-def _shown(statement: _Statement) -> str:
+def _crs_text(statement: _Statement) -> str:
     unit = "" if statement.plan_unit is None else f" in {statement.plan_unit.name}"
     return f"{statement.name}{unit}"
 

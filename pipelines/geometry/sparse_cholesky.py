@@ -32,16 +32,16 @@ _LARGEST_SEPARATOR = 0.5  # of the places that a cut divides; beyond it, they ar
 
 @dataclass(frozen=True)
 class _Front:
-    own: IntArray  # places eliminated here
+    eliminated: IntArray  # places eliminated here
     border: IntArray  # later places that they are coupled to
-    children: tuple[int, ...]  # fronts below, whose borders lie within `own` and `border`
+    children: tuple[int, ...]  # fronts below, whose borders lie within `eliminated` and `border`
 
 
 @dataclass(frozen=True)
 class Pivot:
-    """Columns of the factor that one front eliminates, at the rows `own` (o,) and `border` (b,) of the matrix."""
+    """Columns of the factor that a front eliminates, at rows `eliminated` (o,) and `border` (b,) of the matrix."""
 
-    own: IntArray
+    eliminated: IntArray
     border: IntArray
     diagonal: FloatArray  # (o, o) lower triangle
     below: FloatArray  # (b, o)
@@ -80,17 +80,17 @@ class SparseCholesky:
         """Return the product L⁻¹ right (n · w, m) of vectors (n · w, m) with the inverse of the factor L."""
         solution = np.array(right, dtype=np.float64, order="C")
         for pivot in self.pivots:
-            own = _solved(pivot.diagonal, solution[pivot.own])
-            solution[pivot.own] = own
-            solution[pivot.border] -= pivot.below @ own
+            eliminated = _solved(pivot.diagonal, solution[pivot.eliminated])
+            solution[pivot.eliminated] = eliminated
+            solution[pivot.border] -= pivot.below @ eliminated
         return solution
 
     def coloured(self, white: FloatArray) -> FloatArray:
         """Return vectors (n · w, m) with the inverse matrix as their covariance, from white noise (n · w, m)."""
         solution = np.array(white, dtype=np.float64, order="C")
         for pivot in reversed(self.pivots):
-            own = solution[pivot.own] - pivot.below.T @ solution[pivot.border]
-            solution[pivot.own] = _solved(pivot.diagonal, own, trans=1)
+            eliminated = solution[pivot.eliminated] - pivot.below.T @ solution[pivot.border]
+            solution[pivot.eliminated] = _solved(pivot.diagonal, eliminated, trans=1)
         return solution
 
     def path(self, place: int) -> list[int]:
@@ -102,9 +102,9 @@ class SparseCholesky:
 
     @cached_property
     def _front_of(self) -> IntArray:
-        front_of = np.zeros(sum(len(front.own) for front in self._fronts), dtype=np.int64)
+        front_of = np.zeros(sum(len(front.eliminated) for front in self._fronts), dtype=np.int64)
         for index, front in enumerate(self._fronts):
-            front_of[front.own] = index
+            front_of[front.eliminated] = index
         return front_of
 
     @cached_property
@@ -121,17 +121,17 @@ class SparseCholesky:
         """
         reduced, form = right.toarray(order="C"), np.zeros((right.shape[1], right.shape[1]))
         for pivot in self.pivots:
-            own = reduced[pivot.own]
-            if own.any():
-                own = _solved(pivot.diagonal, own)
-                reduced[pivot.border] -= pivot.below @ own
-                form += own.T @ own
+            eliminated = reduced[pivot.eliminated]
+            if eliminated.any():
+                eliminated = _solved(pivot.diagonal, eliminated)
+                reduced[pivot.border] -= pivot.below @ eliminated
+                form += eliminated.T @ eliminated
         return form
 
     @cached_property
     def inverse_diagonal(self) -> FloatArray:
         """Diagonal blocks (n, w, w) of the inverse matrix."""
-        count = sum(len(front.own) for front in self._fronts)
+        count = sum(len(front.eliminated) for front in self._fronts)
         blocks, width = np.empty((count, self._width, self._width)), self._width
         for places, inverse in self._inverse_on_fronts():
             among = np.arange(len(places))
@@ -148,9 +148,9 @@ class SparseCholesky:
             response = pivot.below @ root_inverse
             across = -on_border @ response
             among = root_inverse.T @ root_inverse - response.T @ across
-            yield front.own, among
+            yield front.eliminated, among
             whole = np.block([[among, across.T], [across, on_border]])
-            places = np.concatenate([pivot.own, pivot.border])
+            places = np.concatenate([pivot.eliminated, pivot.border])
             order = np.argsort(places)
             for child in front.children:
                 rows = order[np.searchsorted(places[order], self.pivots[child].border)]
@@ -161,14 +161,14 @@ class SparseCholesky:
         updates: dict[int, FloatArray] = {}
         width, place_in_front = self._width, np.full(matrix.shape[0] // self._width, -1, dtype=np.int64)
         for index, front in enumerate(self._fronts):
-            places = np.concatenate([front.own, front.border])
+            places = np.concatenate([front.eliminated, front.border])
             place_in_front[places] = np.arange(len(places))
             dense = self._assembled(matrix, front, place_in_front)
             for child in front.children:
                 rows = _rows(place_in_front[self._fronts[child].border], width)
                 dense[np.ix_(rows, rows)] += updates.pop(child)
             place_in_front[places] = -1
-            size = len(front.own) * width
+            size = len(front.eliminated) * width
             try:
                 diagonal = cholesky(dense[:size, :size], lower=True, check_finite=False)
             except np.linalg.LinAlgError:
@@ -176,16 +176,16 @@ class SparseCholesky:
                 raise DegenerateGeometryError("network-undetermined", message) from None
             below = np.ascontiguousarray(_solved(diagonal, dense[size:, :size].T).T)
             updates[index] = dense[size:, size:] - below @ below.T
-            pivots.append(Pivot(_rows(front.own, width), _rows(front.border, width), diagonal, below))
+            pivots.append(Pivot(_rows(front.eliminated, width), _rows(front.border, width), diagonal, below))
         return pivots
 
     def _assembled(self, matrix: bsr_matrix, front: _Front, place_in_front: IntArray) -> FloatArray:
         """Return the front (f · w, f · w) with the matrix's blocks in the columns of its own places."""
-        width, count = self._width, len(front.own) + len(front.border)
+        width, count = self._width, len(front.eliminated) + len(front.border)
         dense = np.zeros((count, width, count, width))
-        slots = _slots(matrix, front.own)
+        slots = _slots(matrix, front.eliminated)
         row = place_in_front[matrix.indices[slots]]
-        column = place_in_front[np.repeat(front.own, np.diff(matrix.indptr)[front.own])]
+        column = place_in_front[np.repeat(front.eliminated, np.diff(matrix.indptr)[front.eliminated])]
         kept = row >= 0
         dense[row[kept], :, column[kept]] = np.swapaxes(matrix.data[slots[kept]], 1, 2)
         return dense.reshape(count * width, count * width)
@@ -201,13 +201,13 @@ def _dissection(matrix: bsr_matrix, position: FloatArray) -> list[_Front]:
     fronts: list[_Front] = []
     eliminated = np.zeros(len(position), dtype=bool)
 
-    def append(own: IntArray, children: tuple[int, ...]) -> int:
-        eliminated[own] = True
+    def append(places: IntArray, children: tuple[int, ...]) -> int:
+        eliminated[places] = True
         coupled = np.concatenate(
-            [matrix.indices[_slots(matrix, own)], *(fronts[child].border for child in children)]
+            [matrix.indices[_slots(matrix, places)], *(fronts[child].border for child in children)]
         )
         border = np.unique(coupled).astype(np.int64)
-        fronts.append(_Front(own, border[~eliminated[border]], children))
+        fronts.append(_Front(places, border[~eliminated[border]], children))
         return len(fronts) - 1
 
     def dissect(places: IntArray) -> int:

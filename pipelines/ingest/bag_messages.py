@@ -44,7 +44,7 @@ _POSE_FRAME_NED = 1
 class PositionSample:
     """A position as a message states it."""
 
-    place: Vector3  # (latitude, longitude, height), or metres east, north, up from the local frame's origin
+    coordinates: Vector3  # (latitude, longitude, height), or metres east, north, up from the local frame's origin
     sigma_enu_m: Vector3  # NaN where unknown
     frame: str  # name of the frame that is at that place
     world: str = ""  # the local frame; "" for geodetic positions
@@ -82,13 +82,13 @@ def stamp_ns(message: Any) -> int | None:
 
 
 def _fix(message: Any) -> PositionSample:
-    place = (float(message.latitude), float(message.longitude), float(message.altitude))
+    coordinates = (float(message.latitude), float(message.longitude), float(message.altitude))
     covariance = np.asarray(message.position_covariance, dtype=np.float64).reshape(3, 3)
     known = message.position_covariance_type != _COVARIANCE_UNKNOWN
     sigma = _sigmas(np.diag(covariance)) if known else _NAN3
-    problem = "no fix (status)" if message.status.status <= _STATUS_NO_FIX else _geodetic_problem(place)
+    problem = "no fix (status)" if message.status.status <= _STATUS_NO_FIX else _geodetic_problem(coordinates)
     return PositionSample(
-        place,
+        coordinates,
         sigma,
         message.header.frame_id,
         receiver="single-frequency",
@@ -98,29 +98,29 @@ def _fix(message: Any) -> PositionSample:
 
 
 def _global_position(message: Any) -> PositionSample:
-    place = (float(message.lat), float(message.lon), float(message.alt_ellipsoid))
+    coordinates = (float(message.lat), float(message.lon), float(message.alt_ellipsoid))
     flags = ("lat_lon_valid", "alt_valid", "alt_ellipsoid_valid")  # since px4_msgs 1.16
     valid = all(getattr(message, flag, True) for flag in flags)
-    problem = _geodetic_problem(place) if valid else "no fix (status)"
+    problem = _geodetic_problem(coordinates) if valid else "no fix (status)"
     if message.dead_reckoning:
         problem = "dead reckoning, without a receiver"
-    return PositionSample(place, _eph_epv(message), BASE, problem=problem)
+    return PositionSample(coordinates, _eph_epv(message), BASE, problem=problem)
 
 
 def _sensor_gps(message: Any) -> PositionSample:
     if hasattr(message, "latitude_deg"):
-        place = (message.latitude_deg, message.longitude_deg, message.altitude_ellipsoid_m)
+        coordinates = (message.latitude_deg, message.longitude_deg, message.altitude_ellipsoid_m)
     else:  # px4_msgs up to release 1.14: 1e-7 degrees and millimetres
-        place = (message.lat * 1e-7, message.lon * 1e-7, message.alt_ellipsoid * 1e-3)
-    place = (float(place[0]), float(place[1]), float(place[2]))
-    problem = "no fix (status)" if message.fix_type not in _PX4_FIXES else _geodetic_problem(place)
+        coordinates = (message.lat * 1e-7, message.lon * 1e-7, message.alt_ellipsoid * 1e-3)
+    coordinates = (float(coordinates[0]), float(coordinates[1]), float(coordinates[2]))
+    problem = "no fix (status)" if message.fix_type not in _PX4_FIXES else _geodetic_problem(coordinates)
     receiver = _PX4_RECEIVER.get(int(message.fix_type), "single-frequency")
     kind = _KIND_OF_PX4.get(int(message.fix_type), 0)
-    return PositionSample(place, _eph_epv(message), "gps", receiver=receiver, problem=problem, fix_kind=kind)
+    return PositionSample(coordinates, _eph_epv(message), "gps", receiver=receiver, problem=problem, fix_kind=kind)
 
 
-def _geodetic_problem(place: Sequence[float]) -> str:
-    lat, lon, alt = place
+def _geodetic_problem(coordinates: Sequence[float]) -> str:
+    lat, lon, alt = coordinates
     if not (math.isfinite(lat) and math.isfinite(lon)):
         return "latitude or longitude is NaN"
     if abs(lat) > 90 or abs(lon) > 360 or (lat == 0 and lon == 0):
@@ -147,12 +147,12 @@ def _px4_local(message: Any) -> PositionSample:
     else:  # px4_msgs up to release 1.13: the upper triangle of a 6×6 covariance, row by row
         ned = np.array([message.x, message.y, message.z], dtype=np.float64)
         variance = np.asarray(message.pose_covariance, dtype=np.float64)[[0, 6, 11]]
-    place = vector3(ENU_FROM_NED @ ned)
+    coordinates = vector3(ENU_FROM_NED @ ned)
     problem = "" if _px4_is_ned(message) else "its frame is not North-East-Down"
-    if not all(map(math.isfinite, place)):
+    if not all(map(math.isfinite, coordinates)):
         problem = "position is NaN"
     sigma = _sigmas(np.abs(ENU_FROM_NED) @ variance)
-    return PositionSample(place, sigma, BASE, world="PX4's local NED", problem=problem)
+    return PositionSample(coordinates, sigma, BASE, world="PX4's local NED", problem=problem)
 
 
 def _sigmas(variance: Any) -> Vector3:

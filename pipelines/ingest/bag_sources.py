@@ -82,7 +82,7 @@ def ranked_receivers(bag: Bag, topics: Sequence[BagTopic]) -> tuple[list[BagTopi
             continue
         if not sample.problem:
             one = receivers[message.topic]
-            one.fixes.append((message.bag_ns / 1e9, *sample.place))
+            one.fixes.append((message.bag_ns / 1e9, *sample.coordinates))
             one.sigma_h_m.append(math.hypot(*sample.sigma_enu_m[:2]) / math.sqrt(2.0))
             one.kinds.append(sample.fix_kind)
     longest_s = max(one.span_s for one in receivers.values())

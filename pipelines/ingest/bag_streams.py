@@ -402,7 +402,7 @@ def _add_navigation(
         else:
             positions.frame = positions.frame or position.frame
             positions.world = positions.world or position.world
-            values = (*position.place, *position.sigma_enu_m)
+            values = (*position.coordinates, *position.sigma_enu_m)
             positions.add(stamp_ns(decoded), message.bag_ns, values, position.receiver)
     if attitudes is not None and message.topic == attitudes.topic:
         attitude = ATTITUDES[message.type](decoded)

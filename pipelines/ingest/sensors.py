@@ -68,8 +68,8 @@ def with_sensors(photos: Sequence[Photo]) -> list[Photo]:
     sensor_of: dict[str, str] = {}
     for rule in (_by_xmp, _by_suffix, _by_number, _by_size):
         sensor_of |= rule([photo for photo in photos if photo.name not in sensor_of], photos)
-    sensor_of = _apart(photos, sensor_of)
-    return _alike([replace(photo, sensor=sensor_of.get(photo.name, "")) for photo in photos])
+    sensor_of = _sensors_by_band(photos, sensor_of)
+    return _with_common_sensor([replace(photo, sensor=sensor_of.get(photo.name, "")) for photo in photos])
 
 
 def chosen_sensor(photos: Sequence[Photo], wanted: str | None, remarks: Remarks) -> list[Photo]:
@@ -312,7 +312,7 @@ def _sides(photo: Photo) -> tuple[int, int]:
     return max(width, height), min(width, height)
 
 
-def _apart(photos: Sequence[Photo], sensor_of: Mapping[str, str]) -> dict[str, str]:
+def _sensors_by_band(photos: Sequence[Photo], sensor_of: Mapping[str, str]) -> dict[str, str]:
     """Return the sensors, bands of one camera and name but of different wavelengths or lenses told apart."""
     members: dict[tuple[str, str], list[Photo]] = {}
     for photo in photos:
@@ -331,7 +331,7 @@ def _apart(photos: Sequence[Photo], sensor_of: Mapping[str, str]) -> dict[str, s
     return result
 
 
-def _alike(photos: list[Photo]) -> list[Photo]:
+def _with_common_sensor(photos: list[Photo]) -> list[Photo]:
     """Return the photographs, those without a stated sensor with that of all others of their model and size."""
     known: dict[tuple[object, ...], set[str]] = {}
     for photo in photos:

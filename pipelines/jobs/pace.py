@@ -42,7 +42,7 @@ def corrected(stage: str, modelled: float) -> float:
     A stage that never ran here is taken to be as slow against its model as those that did, in the median: most of
     what they differ by from the machine of the model is the processor.
     """
-    kept = _kept()
+    kept = _kept_paces()
     medians = {name: statistics.median_low(ratios) for name, ratios in kept.items() if ratios}
     if stage in medians:
         return modelled * medians[stage]
@@ -130,6 +130,6 @@ def _document() -> dict[str, dict[str, list[float]]]:
         return {}
 
 
-def _kept() -> dict[str, list[float]]:
+def _kept_paces() -> dict[str, list[float]]:
     stages = _document().get(_key(), {})
     return {stage: [ratio for ratio in ratios if _LEAST < ratio < _MOST] for stage, ratios in stages.items()}

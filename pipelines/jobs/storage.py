@@ -72,13 +72,13 @@ class Storage:
     def check(self) -> None:
         """Connect to the store."""
         with self._reached():
-            store, home = self._place("")
+            store, home = self._folder_in_store("")
             store.exists(home)
 
     def index(self, part: str) -> PartIndex | None:
         """Return the index of a part, or None; an InputError: it is damaged, or leads out of its part."""
         with self._reached():
-            store, home = self._place(part)
+            store, home = self._folder_in_store(part)
             url = f"{home}.json"
             if not store.exists(url):
                 return None
@@ -102,7 +102,7 @@ class Storage:
         worker that another attempt at its job has taken over.
         """
         with self._reached():
-            (store, home), before = self._place(part), self.index(part)
+            (store, home), before = self._folder_in_store(part), self.index(part)
             if writer == "worker" and before is not None and before.attempt != attempt:
                 raise StorageError("attempt-superseded", f"Another attempt at the job of {part} has taken over.")
             held = set() if before is None else {_digest(name, *state) for name, state in before.files.items()}
@@ -135,7 +135,7 @@ class Storage:
         Files that the folder had sent `before`, and that are no longer listed, are deleted.
         """
         with self._reached():
-            (store, home), index = self._place(part), self.index(part)
+            (store, home), index = self._folder_in_store(part), self.index(part)
             if index is None:
                 return None
             older = [name for name, state in index.files.items() if _is_older(folder / part / name, state)]
@@ -161,10 +161,10 @@ class Storage:
 
     def write_index(self, index: PartIndex) -> None:
         with self._reached():
-            store, home = self._place(index.part)
+            store, home = self._folder_in_store(index.part)
             store.pipe_file(f"{home}.json", json.dumps(index.model_dump(mode="json")).encode())
 
-    def _place(self, part: str) -> tuple[Any, str]:
+    def _folder_in_store(self, part: str) -> tuple[Any, str]:
         """Return the library of the store, and the folder of a part's objects as that library writes it."""
         import fsspec
 

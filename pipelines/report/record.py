@@ -1,7 +1,7 @@
 """Record of the processing: stages with options, inputs, versions and times; remarks; and the delivered files.
 
-A file has its CRS, cell size, share measured and interpolated, σ, size and hash. Other stages have left for the page:
-LiDAR that the training has used, the comparison with a reference, and the change since an earlier survey.
+A file has its CRS, cell size, share measured and interpolated, σ, size and hash. Other stages have left for the
+page: LiDAR that the training has used, the comparison with a reference, and the change since an earlier survey.
 """
 
 from __future__ import annotations
@@ -266,10 +266,10 @@ def _values(workspace: Workspace, stage: str) -> dict[str, Any]:
 
 
 def _file(file: Path, path: str, description: str, values: dict[str, Any]) -> DeliveredFile:
-    crs, heights, sigma = _place(file)
+    crs, heights, sigma = _stated_place(file)
     shares = _shares(values) if crs and path != "export/splat.ply" else ""
     if file.name in _DRAWN_OF:  # it has no sidecar of its own
-        crs, heights, _ = _place(file.with_name(_DRAWN_OF[file.name]))
+        crs, heights, _ = _stated_place(file.with_name(_DRAWN_OF[file.name]))
     elif file.suffix == ".geojson":
         crs = "longitude, latitude (WGS84)"
     inside = [each for each in file.rglob("*") if each.is_file()] if file.is_dir() else [file]
@@ -287,7 +287,7 @@ def _file(file: Path, path: str, description: str, values: dict[str, Any]) -> De
     )
 
 
-def _place(file: Path) -> tuple[str, str, str]:
+def _stated_place(file: Path) -> tuple[str, str, str]:
     """Return CRS, heights and σ as the sidecar of a file states them; empty without one."""
     sidecar = _sidecar(file)
     if sidecar is None:

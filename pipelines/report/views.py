@@ -91,7 +91,7 @@ class ViewsFacts:
     views are printed with pictures.
     """
 
-    shown: tuple[TestView, ...]
+    pictured: tuple[TestView, ...]
     rows: tuple[tuple[str, str], ...]
     gain: int
     renders: int
@@ -115,7 +115,7 @@ def views_facts(workspace: Workspace, test: PhotometricFigures, most: int) -> Vi
     files = {view.image: workspace.root / RENDERS / render_name(view.image) for view in worst_first}
     saved = {name: file for name, file in files.items() if file.is_file()}
     return ViewsFacts(
-        shown=tuple(_view(name, fields[name], file) for name, file in list(saved.items())[:most]),
+        pictured=tuple(_view(name, fields[name], file) for name, file in list(saved.items())[:most]),
         rows=tuple((view.image, fields[view.image]) for view in views),
         gain=DIFFERENCE_GAIN,
         renders=len(saved),
@@ -169,11 +169,11 @@ def _panels(rows: list[dict[str, float]]) -> dict[str, Mapping[str, tuple[FloatA
     panels: dict[str, Mapping[str, tuple[FloatArray, FloatArray]]] = {}
     for quantity, names in _PANELS.items():
         lines = {}
-        for name, shown in names.items():
+        for name, label in names.items():
             values = np.array([(row["iteration"], row[name]) for row in rows if name in row]).reshape(-1, 2)
             values = values[np.isfinite(values).all(axis=1)]
             if len(values):
-                lines[shown] = (values[:, 0], values[:, 1])
+                lines[label] = (values[:, 0], values[:, 1])
         if lines:
             panels[quantity] = lines
     return panels

@@ -61,7 +61,7 @@ def settle_imported(
             return model
         if rule == "hold":
             if gain > _WORSE:
-                _say("imported-cameras-fit-worse", _HELD, before_px, after_px, gain)
+                _warn("imported-cameras-fit-worse", _HELD, before_px, after_px, gain)
             return model
         if again is not None:
             better = _in_rounds(colmap, model, again, threads, progress)
@@ -79,7 +79,7 @@ def settle_imported(
     lens_gain, held_px, freed_px = _gain(better, freed, lenses)
     lens = lens_gain > _WORSE
     sentence, after_px = (_LENS_TOO, freed_px) if lens else (_POSES, held_px)
-    _say("imported-cameras-adjusted", sentence, before_px, after_px, gain)
+    _warn("imported-cameras-adjusted", sentence, before_px, after_px, gain)
     return freed if lens else better
 
 
@@ -107,7 +107,7 @@ _HELD = (
 )
 
 
-def _say(code: str, sentence: str, before_px: float, after_px: float, gain: float) -> None:
+def _warn(code: str, sentence: str, before_px: float, after_px: float, gain: float) -> None:
     log.warning(_FIT + sentence, before_px, after_px, gain, extra={"code": code})
 
 

@@ -76,7 +76,7 @@ def _join_some(
             log.info("A part of %d photographs is not joined: %s.", len(images), found)
             continue
         moved, joined = type(part)(part), type(whole)(whole)
-        moved.transform(colmap.Sim3d(found.place.matrix()[:3]))
+        moved.transform(colmap.Sim3d(found.model_from_part.matrix()[:3]))
         add_part(colmap, joined, moved)
         if _settle(colmap, job, joined, images) < _FEWEST_SHARED:
             log.info("A part of %d photographs shares too few points with the model when adjusted.", len(images))
@@ -137,11 +137,13 @@ def _photographs_apart(colmap: Any, job: SfmJob, whole: Any) -> list[Any]:
     for (one, _), rows in _pairs_across(colmap, job.database, whole).items():
         matches[one] = matches.get(one, 0) + len(rows)
     with colmap.Database.open(job.database) as opened:
-        alone = [_alone(colmap, opened, whole, one) for one in sorted(matches, key=lambda one: -matches[one])]
+        alone = [
+            _model_of_one(colmap, opened, whole, one) for one in sorted(matches, key=lambda one: -matches[one])
+        ]
     return [model for model in alone if model is not None]
 
 
-def _alone(colmap: Any, database: Any, whole: Any, image_id: int) -> Any:
+def _model_of_one(colmap: Any, database: Any, whole: Any, image_id: int) -> Any:
     """Return a model of one photograph, in its own frame; None: its camera is one of several of a rig."""
     stored = database.read_image(image_id)
     rig = database.read_rig_with_sensor(stored.data_id.sensor_id)

@@ -65,12 +65,12 @@ class Side:
         focal_px = {key: camera.mean_focal_px for key, camera in self.cameras.items()}
         return np.array([focal_px[key] for key in self.camera.tolist()])
 
-    def moved(self, place: Similarity) -> Self:
+    def moved(self, model_from_part: Similarity) -> Self:
         return replace(
             self,
-            cam_from_model=self.cam_from_model @ place.rotation.T,
-            center=place.apply(self.center),
-            point=place.apply(self.point),
+            cam_from_model=self.cam_from_model @ model_from_part.rotation.T,
+            center=model_from_part.apply(self.center),
+            point=model_from_part.apply(self.point),
         )
 
     def residuals_px(self, point: FloatArray) -> FloatArray:
@@ -87,7 +87,7 @@ class Side:
 class Tie:
     """The place of a part, model ← part, its σ, and the matches that agree with it."""
 
-    place: Similarity
+    model_from_part: Similarity
     sigma: float  # of the part's centres, over their distance to the ground
     matches: int
     pairs: int
@@ -142,9 +142,9 @@ def tie(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed: int = 0)
     best, fit = None, np.inf
     alike = np.ones(_KINDS)
     for start in _starts(colmap, model, part, has_scale=has_scale, seed=seed):
-        place, cost = _refined(model, part, start, alike, has_scale=has_scale)
+        model_from_part, cost = _refined(model, part, start, alike, has_scale=has_scale)
         if cost < fit:
-            best, fit = place, cost
+            best, fit = model_from_part, cost
     if best is None:
         return "no place of it agrees with its matches"
     best, _ = _refined(model, part, best, _sigma_px(model, part, best), has_scale=has_scale)
@@ -166,8 +166,8 @@ def _chosen(model: Side, part: Side) -> BoolArray:
     return chosen
 
 
-def _judged(model: Side, part: Side, place: Similarity, *, has_scale: bool) -> Tie | str:
-    worst_px = np.nanmax(np.abs(_equations(model, part, place)), axis=1)
+def _judged(model: Side, part: Side, model_from_part: Similarity, *, has_scale: bool) -> Tie | str:
+    worst_px = np.nanmax(np.abs(_equations(model, part, model_from_part)), axis=1)
     agree = worst_px < _GATE_PX
     if agree.sum() < max(_FEWEST_MATCHES, _LEAST_SHARE * len(agree)):
         return f"{int(agree.sum())} of its {len(agree)} matches with the model agree with one place"
@@ -181,16 +181,16 @@ def _judged(model: Side, part: Side, place: Similarity, *, has_scale: bool) -> T
                 f"{count} of the {known} {which} among its matches agree with one place, of which "
                 f"{100 * _LEAST_SHARE:.0f} % and {_FEWEST_POINTS} are needed"
             )
-    sigma = _sigma(model, part, place, has_scale=has_scale)
+    sigma = _sigma(model, part, model_from_part, has_scale=has_scale)
     if not sigma < _MOST_SIGMA:
         return f"its matches leave its place open by {100 * sigma:.0f} % of the distance to the ground"
     pairs = len(set(zip(model.image[agree].tolist(), part.image[agree].tolist(), strict=True)))
-    return Tie(place, sigma, int(agree.sum()), pairs, points)
+    return Tie(model_from_part, sigma, int(agree.sum()), pairs, points)
 
 
-def _equations(model: Side, part: Side, place: Similarity) -> FloatArray:
+def _equations(model: Side, part: Side, model_from_part: Similarity) -> FloatArray:
     """Return the residuals (M, 5) in pixels: of the model's point, of the part's, of the rays; NaN: none."""
-    moved = part.moved(place)
+    moved = part.moved(model_from_part)
     equations = np.full((len(model.image), 5), np.nan)
     for columns, seen, side in ((slice(0, 2), moved, model), (slice(2, 4), model, moved)):
         rows = side.is_point
@@ -205,9 +205,9 @@ def _equations(model: Side, part: Side, place: Similarity) -> FloatArray:
     return equations
 
 
-def _sigma_px(model: Side, part: Side, place: Similarity) -> FloatArray:
+def _sigma_px(model: Side, part: Side, model_from_part: Similarity) -> FloatArray:
     """Return σ (5,) of each kind of residual: points near the rim of a model are less exact than rays."""
-    size = np.abs(_equations(model, part, place))
+    size = np.abs(_equations(model, part, model_from_part))
     kinds = [size[:, :2], size[:, 2:4], size[:, 4:]]
     sigma = [NORMAL_MAD * np.nanmedian(kind) if np.isfinite(kind).any() else _LEAST_SIGMA_PX for kind in kinds]
     return np.asarray(np.maximum(np.repeat(sigma, [2, 2, 1]), _LEAST_SIGMA_PX))
@@ -242,10 +242,10 @@ def _at(delta: FloatArray, part: Side, start: Similarity) -> Similarity:
     return perturbation(full, start.apply(part.center.mean(axis=0))) @ start
 
 
-def _sigma(model: Side, part: Side, place: Similarity, *, has_scale: bool) -> float:
+def _sigma(model: Side, part: Side, model_from_part: Similarity, *, has_scale: bool) -> float:
     """Return the largest σ of the part's centres by the matches, over the median distance to the model's points."""
     count = 7 if has_scale else 6
-    at = partial(_residuals, model, part, place, _sigma_px(model, part, place))
+    at = partial(_residuals, model, part, model_from_part, _sigma_px(model, part, model_from_part))
     residual = at(np.zeros(count))
     depth = float(np.median(np.linalg.norm((model.point - model.center)[model.is_point], axis=1)))
     step = 1e-6 * np.concatenate([np.ones(count - 3), np.full(3, depth)])
@@ -258,8 +258,8 @@ def _sigma(model: Side, part: Side, place: Similarity, *, has_scale: bool) -> fl
     unit = step * 1e6
     covariance = np.zeros((7, 7))
     covariance[7 - count :, 7 - count :] = (vectors / values) @ vectors.T * np.outer(unit, unit)
-    centers = place.apply(np.unique(part.center, axis=0))
-    of_centers = covariance_at(centers, covariance, place.apply(part.center.mean(axis=0)))
+    centers = model_from_part.apply(np.unique(part.center, axis=0))
+    of_centers = covariance_at(centers, covariance, model_from_part.apply(part.center.mean(axis=0)))
     return float(np.sqrt(np.trace(of_centers, axis1=1, axis2=2).max())) / depth
 
 
@@ -267,8 +267,8 @@ def _starts(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed: int)
     """Yield places of the part: by its photographs' places, by the model's in the part, by the poses of pairs."""
     yield from _by_resection(colmap, model, part, has_scale=has_scale, seed=seed)
     if has_scale:
-        for place in _by_resection(colmap, part, model, has_scale=True, seed=seed):
-            yield place.inverse()
+        for model_from_part in _by_resection(colmap, part, model, has_scale=True, seed=seed):
+            yield model_from_part.inverse()
     pairs = list(zip(model.image.tolist(), part.image.tolist(), strict=True))
     for pair in sorted(set(pairs), key=lambda pair: (-pairs.count(pair), pair))[:_STARTS]:
         rows = np.array([each == pair for each in pairs])
@@ -303,8 +303,8 @@ def _by_resection(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed
             )
             scale = _ratio(_depths(placed, model.of(seen)), part.of(seen))
         if np.isfinite(scale):
-            place = Similarity(scale, rotation, np.zeros(3))
-            yield replace(place, translation=-pose[:, :3].T @ pose[:, 3] - place.apply(center))
+            model_from_part = Similarity(scale, rotation, np.zeros(3))
+            yield replace(model_from_part, translation=-pose[:, :3].T @ pose[:, 3] - model_from_part.apply(center))
 
 
 def _by_pair(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed: int) -> Iterator[Similarity]:
@@ -335,8 +335,10 @@ def _by_pair(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed: int
         scale = _ratio(_depths(turned.of(own), model.of(own)), part.of(own)) / length
     if not (np.isfinite(length) and np.isfinite(scale) and length > 0 and scale > 0):
         return
-    place = Similarity(scale, cam_from_model.T @ part.cam_from_model[0], np.zeros(3))
-    yield replace(place, translation=model.center[0] + base / length - place.apply(part.center[0]))
+    model_from_part = Similarity(scale, cam_from_model.T @ part.cam_from_model[0], np.zeros(3))
+    yield replace(
+        model_from_part, translation=model.center[0] + base / length - model_from_part.apply(part.center[0])
+    )
 
 
 def _depths(one: Side, other: Side) -> FloatArray:

@@ -62,7 +62,7 @@ class _View:
 
 
 @dataclass(frozen=True)
-class _Shown:
+class _ModelPhotograph:
     """Photograph of a model: its camera, and pixels (N, 2) and places (N, 3) of the points that it shows."""
 
     view: _View
@@ -81,13 +81,13 @@ class _Features:
 
 @dataclass(frozen=True)
 class _Prediction:
-    """Where cameras are, by fix and attitude: place geo ← model, errors of the registered, and σ.
+    """Where cameras are, by fix and attitude: `geo_from_model`, errors of the registered, and σ.
 
     `fixes` (K, 3) and `error` (K, 3) are in geo, `boresight` is a rotation vector in each camera's frame, by its
     number: lenses of a rig look elsewhere.
     """
 
-    place: Similarity
+    geo_from_model: Similarity
     fixes: FloatArray
     error: FloatArray
     boresight: dict[int, FloatArray]
@@ -105,7 +105,7 @@ def add_predicted(colmap: Any, job: SfmJob, model: Any, progress: Progress) -> i
     if prediction is None:
         return 0
     outside = _outside(model, job.survey, prediction)
-    inside = {key: _shown(model, key) for key in sorted(model.reg_image_ids())}
+    inside = {key: _model_photograph(model, key) for key in sorted(model.reg_image_ids())}
     matches: dict[tuple[int, int], IntArray] = {}
     pairs = 0
     with colmap.Database.open(job.database) as opened, progress.task("predicted matches", len(outside)) as task:
@@ -133,8 +133,8 @@ def add_predicted(colmap: Any, job: SfmJob, model: Any, progress: Progress) -> i
 def _prediction(model: Any, survey: Survey) -> _Prediction | None:
     """Return how fixes and attitudes predict cameras of a model; None: they do not place it, or are too few."""
     measured = {image.name: image for image in survey.images}
-    place = placed_by_positions(model, measured)
-    if isinstance(place, str):
+    geo_from_model = placed_by_positions(model, measured)
+    if isinstance(geo_from_model, str):
         return None
     fixes, error, turns, cameras = [], [], [], []
     for key in sorted(model.reg_image_ids()):
@@ -143,8 +143,8 @@ def _prediction(model: Any, survey: Survey) -> _Prediction | None:
         if fix is None or attitude is None:
             continue
         fixes.append(fix.position_in_geo)
-        error.append(place.apply(image.projection_center()[None])[0] - fix.position_in_geo)
-        geo_from_cam = place.rotation @ image.cam_from_world().rotation.matrix().T
+        error.append(geo_from_model.apply(image.projection_center()[None])[0] - fix.position_in_geo)
+        geo_from_cam = geo_from_model.rotation @ image.cam_from_world().rotation.matrix().T
         cameras.append(image.camera_id)
         turns.append(log_so3(matrix_from_quat_xyzw(attitude.quat_xyzw).T @ geo_from_cam))
     if len(fixes) < _FEWEST_REGISTERED:
@@ -159,7 +159,7 @@ def _prediction(model: Any, survey: Survey) -> _Prediction | None:
     # Fixes near one line leave a tilt of the model about it, which attitudes of one heading take for a boresight.
     _, width_m, _ = np.linalg.svd(at - at.mean(axis=0), compute_uv=False)  # √N times the extent
     sigma_rad = float(np.hypot(sigma_rad, sigma_m / max(float(width_m), sigma_m)))
-    return _Prediction(place, at, off, boresight, sigma_m, sigma_rad)
+    return _Prediction(geo_from_model, at, off, boresight, sigma_m, sigma_rad)
 
 
 def _error_near(position: FloatArray, fixes: FloatArray, error: FloatArray) -> FloatArray:
@@ -171,7 +171,7 @@ def _error_near(position: FloatArray, fixes: FloatArray, error: FloatArray) -> F
 def _outside(model: Any, survey: Survey, prediction: _Prediction) -> dict[int, _View]:
     """Return predicted cameras, in the model's frame, of photographs that are not in it, by COLMAP's numbers."""
     inside = set(model.reg_image_ids())
-    back = prediction.place.inverse()
+    back = prediction.geo_from_model.inverse()
     found = {}
     for key, image in enumerate(survey.images, start=1):
         if (
@@ -186,12 +186,12 @@ def _outside(model: Any, survey: Survey, prediction: _Prediction) -> dict[int, _
         geo_from_cam = matrix_from_quat_xyzw(image.attitude.quat_xyzw) @ exp_so3(
             prediction.boresight[image.camera_id]
         )
-        rotation = geo_from_cam.T @ prediction.place.rotation
+        rotation = geo_from_cam.T @ prediction.geo_from_model.rotation
         found[key] = _View(lens_of_colmap(model.cameras[image.camera_id]), rotation, back.apply(position[None])[0])
     return found
 
 
-def _shown(model: Any, key: int) -> _Shown:
+def _model_photograph(model: Any, key: int) -> _ModelPhotograph:
     image = model.images[key]
     view = _View(
         lens_of_colmap(model.cameras[image.camera_id]),
@@ -200,10 +200,12 @@ def _shown(model: Any, key: int) -> _Shown:
     )
     seen = [point for point in image.points2D if point.has_point3D()]
     xy = np.array([point.xy for point in seen]).reshape(-1, 2)
-    return _Shown(view, xy, np.array([model.points3D[point.point3D_id].xyz for point in seen]).reshape(-1, 3))
+    return _ModelPhotograph(
+        view, xy, np.array([model.points3D[point.point3D_id].xyz for point in seen]).reshape(-1, 3)
+    )
 
 
-def _partners(view: _View, inside: dict[int, _Shown], prediction: _Prediction) -> list[int]:
+def _partners(view: _View, inside: dict[int, _ModelPhotograph], prediction: _Prediction) -> list[int]:
     """Return the photographs of the model that show most points that a camera is predicted to show."""
     size = np.array([view.camera.width, view.camera.height])
     near = sorted(inside, key=lambda key: float(np.linalg.norm(inside[key].view.center - view.center)))
@@ -220,7 +222,7 @@ def _partners(view: _View, inside: dict[int, _Shown], prediction: _Prediction) -
 
 def _sigma_px(view: _View, away: FloatArray, prediction: _Prediction) -> FloatArray:
     """Return σ (N,) of the places of points at distances (N,) in a predicted camera."""
-    sigma_rad = np.hypot(prediction.sigma_m / (prediction.place.scale * away), prediction.sigma_rad)
+    sigma_rad = np.hypot(prediction.sigma_m / (prediction.geo_from_model.scale * away), prediction.sigma_rad)
     return np.asarray(view.camera.mean_focal_px * sigma_rad)
 
 
@@ -248,7 +250,7 @@ class _Where:
     seen: BoolArray  # (N,)
 
 
-def _predicted(features: _Features, shown: _Shown, other: _View, prediction: _Prediction) -> _Where:
+def _predicted(features: _Features, shown: _ModelPhotograph, other: _View, prediction: _Prediction) -> _Where:
     view, tree = shown.view, cKDTree(shown.xy_px)
     distance = np.linalg.norm(shown.point - view.center, axis=1)
     around = distance[tree.query(features.xy_px, k=_POINTS_AROUND)[1]]

@@ -164,7 +164,7 @@ def build_scene(name: str, seed: np.random.SeedSequence, options: EpochOptions =
         buildings = (*buildings, building)
         changes.append(SceneChange("new", _outline(building)))
     sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
-    mesh = _without(builder.build(), gone)
+    mesh = _mesh_without(builder.build(), gone)
     return SimulatedScene(mesh, layout.plan, axes, sun, tuple(sites), (17.5, 18.5), buildings, tuple(changes))
 
 
@@ -172,7 +172,7 @@ def _outline(building: Building) -> FloatArray:
     return np.array(building.rectangle(building.length_m / 2, building.width_m / 2, 0.0))[:, :2]
 
 
-def _without(mesh: Mesh, gone: slice) -> Mesh:
+def _mesh_without(mesh: Mesh, gone: slice) -> Mesh:
     kept = np.ones(len(mesh.corners), dtype=bool)
     kept[gone] = False
     return Mesh(

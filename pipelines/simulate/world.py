@@ -67,13 +67,13 @@ def _chosen_sites(
     for kind, share in _SHARES.items():
         wanted = round(share * count)
         own = [i for i in order if sites[i].kind == kind and rays[i] >= WANTED_RAYS]
-        chosen += _apart(sites, own, chosen)[:wanted]
+        chosen += _spaced(sites, own, chosen)[:wanted]
     remaining = [i for i in order if i not in set(chosen) and rays[i] >= LEAST_RAYS]
     remaining.sort(key=lambda i: -min(int(rays[i]), WANTED_RAYS))
-    return [sites[i] for i in sorted((chosen + _apart(sites, remaining, chosen))[:count])]
+    return [sites[i] for i in sorted((chosen + _spaced(sites, remaining, chosen))[:count])]
 
 
-def _apart(sites: Sequence[TargetSite], candidates: Sequence[int], others: Sequence[int]) -> list[int]:
+def _spaced(sites: Sequence[TargetSite], candidates: Sequence[int], others: Sequence[int]) -> list[int]:
     """Return the candidates, in order, that keep their distance from `others` and each other."""
     taken: list[int] = []
     for i in candidates:

@@ -59,7 +59,7 @@ def chosen_pixels(
 
 
 @njit(nogil=True, error_model="numpy")
-def _place(depth: Any, row: int, column: int, lens: Any, turn: Any, center: Any) -> tuple[float, float, float]:
+def _surface_at(depth: Any, row: int, column: int, lens: Any, turn: Any, center: Any) -> tuple[float, float, float]:
     """Return the place of a pixel's surface."""
     z = np.float64(depth[row, column])
     x, y = z * ((column + 0.5 - lens[2]) / lens[0]), z * ((row + 0.5 - lens[3]) / lens[1])
@@ -81,7 +81,7 @@ def _window(
         for column in range(0, width, look):
             if depth[row, column] == 0:
                 continue
-            east, north, _ = _place(depth, row, column, lens, turn, center)
+            east, north, _ = _surface_at(depth, row, column, lens, turn, center)
             if east >= box[0] and north >= box[1] and east < box[2] and north < box[3]:
                 top, bottom = min(top, row), max(bottom, row)
                 left, right = min(left, column), max(right, column)
@@ -123,7 +123,7 @@ def _chosen(
             size_m = scale * own / lens[0]
             if not (own > 0 and size_m < coarsest_m):
                 continue
-            x, y, z = _place(depth, row, column, lens, turn, center)
+            x, y, z = _surface_at(depth, row, column, lens, turn, center)
             if not (x >= box[0] and y >= box[1] and x < box[2] and y < box[3]):
                 continue
             # The inverse depth of a plane is linear on the image, at any angle of view.
@@ -133,11 +133,11 @@ def _chosen(
             )
             if not bend < most_bend:
                 continue
-            a, b, c = _place(depth, row, column + reach, lens, turn, center)
-            i, j, k = _place(depth, row, column - reach, lens, turn, center)
+            a, b, c = _surface_at(depth, row, column + reach, lens, turn, center)
+            i, j, k = _surface_at(depth, row, column - reach, lens, turn, center)
             a, b, c = a - i, b - j, c - k  # to the right
-            d, e, f = _place(depth, row + reach, column, lens, turn, center)
-            i, j, k = _place(depth, row - reach, column, lens, turn, center)
+            d, e, f = _surface_at(depth, row + reach, column, lens, turn, center)
+            i, j, k = _surface_at(depth, row - reach, column, lens, turn, center)
             d, e, f = d - i, e - j, f - k  # downwards
             i, j, k = b * f - c * e, c * d - a * f, a * e - b * d
             length = np.sqrt(i * i + j * j + k * k)

@@ -216,7 +216,7 @@ class _Cells:
 
     def places(self) -> FloatArray:
         """Return the middles (K, 3) of the cells that enough views show, at the median height."""
-        shown = self._shown()
+        shown = self._rows_in_views()
         row, column = np.divmod(shown, self._shape[1])
         plan = self.corner + (np.stack([column, row], axis=1) + 0.5) * self.cell_m
         return np.column_stack([plan, np.nanmedian(self._height[shown], axis=1)])
@@ -224,8 +224,8 @@ class _Cells:
     def grid(self, chosen: np.ndarray) -> np.ndarray:
         """Return all cells (R, C), true where the place is chosen."""
         cells = np.zeros(len(self._height), dtype=bool)
-        cells[self._shown()[chosen]] = True
+        cells[self._rows_in_views()[chosen]] = True
         return cells.reshape(self._shape)
 
-    def _shown(self) -> IntArray:
+    def _rows_in_views(self) -> IntArray:
         return np.flatnonzero(self._views >= LEAST_PHOTOGRAPHS)

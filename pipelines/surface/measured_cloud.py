@@ -257,7 +257,7 @@ def read_thinned(
         raise InputError(
             "no-overlap",
             f"None of the {files.tally.read} points lies in the scene of the photographs: the cloud is of another "
-            f"place, or its CRS ({', '.join(files.crs_names)}) is wrong.{_said(files.notes)}",
+            f"place, or its CRS ({', '.join(files.crs_names)}) is wrong.{_remarks_text(files.notes)}",
         )
     cloud = _limited(waiting, voxel_m, thinning.most)
     log.info(
@@ -310,13 +310,13 @@ def _explained(placed: PlacedCrs) -> Iterator[None]:
     except InputError as error:
         if not placed.remarks:
             raise
-        message = error.message + _said(placed.remarks)
+        message = error.message + _remarks_text(placed.remarks)
         raise InputError(
             error.code, message, path=error.path, line=error.line, field=error.field, remedy=error.remedy
         ) from error
 
 
-def _said(remarks: Sequence[Remark]) -> str:
+def _remarks_text(remarks: Sequence[Remark]) -> str:
     return "".join(f" {remark.text}" for remark in remarks)
 
 

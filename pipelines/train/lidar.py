@@ -64,8 +64,8 @@ def held_out_points(
         nearest_m[rows], view[rows] = seen.depth_m, index
         towards = _towards(standing.position_in_model[rows], standing.normal_in_model[rows], center)
         ray = camera.rays(np.stack([seen.column, seen.row], axis=1) + 0.5) @ rotation
-        shown = center + depth_m[:, None] * ray
-        off_m = np.einsum("pi,pi->p", shown - standing.position_in_model[rows], towards)
+        surface_in_model = center + depth_m[:, None] * ray
+        off_m = np.einsum("pi,pi->p", surface_in_model - standing.position_in_model[rows], towards)
         normal[rows], before_m[rows] = towards, np.where(depth_m > 0, off_m, np.nan)
     shown_rows = view >= 0
     return HeldOutPoints(
@@ -117,7 +117,7 @@ class ComparedLidar:
     held: LidarCloud | None  # points that the training is not given; None: none
     maps: DepthMaps  # depth maps of the training views
     views: DepthViews  # the same as one set
-    shown: FloatArray  # (S, 3) surface that they show
+    surface_in_model: FloatArray  # (S, 3) surface that they show
     pixel_m: float  # size of their pixels on the surface
     registration: Registration  # shift of the cloud, and its record
     record: LidarRegistration
@@ -155,10 +155,10 @@ def compared_lidar(
     cloud, held = read_cloud(
         files, maps.scene, survey, pixel_m, progress=progress, track=track, held_out=options.lidar_held_out
     )
-    shown = np.concatenate([surface.points(index, _STRIDE) for index in map(int, maps.scene.train)])
-    found = registration_of(cloud, shown, views, seed, depths=isinstance(files, PhotoDepths))
+    surface_in_model = np.concatenate([surface.points(index, _STRIDE) for index in map(int, maps.scene.train)])
+    found = registration_of(cloud, surface_in_model, views, seed, depths=isinstance(files, PhotoDepths))
     record = _checked(found, cloud, maps.scene, georeference, options)
-    return ComparedLidar(cloud, held, maps, views, shown, pixel_m, found, record)
+    return ComparedLidar(cloud, held, maps, views, surface_in_model, pixel_m, found, record)
 
 
 def lidar_surface(
@@ -169,18 +169,18 @@ def lidar_surface(
 
     def judgement(points: LidarCloud) -> CloudVerdict:
         return verdict(
-            points, compared.views, compared.shown, sigma_m=options.lidar_sigma, pixel_m=compared.pixel_m
+            points, compared.views, compared.surface_in_model, sigma_m=options.lidar_sigma, pixel_m=compared.pixel_m
         )
 
     cloud = compared.cloud.moved(-shift)
-    judged, kept_free, held_out = judgement(cloud), compared.shown, None
+    judged, kept_free, held_out = judgement(cloud), compared.surface_in_model, None
     if compared.held is not None:
         held = compared.held.moved(-shift)
         gone = judgement(held).rejected
         held_out = held_out_points(
             held, gone, rows_of(cloud, ~judged.rejected), compared.maps, options.lidar_held_out
         )
-        kept_free = np.concatenate([compared.shown, held.position_in_model])
+        kept_free = np.concatenate([compared.surface_in_model, held.position_in_model])
     report = LidarReport(
         **asdict(files.tally),
         crs=files.crs_names,
@@ -226,7 +226,7 @@ def _depth_views(maps: DepthMaps) -> DepthViews:
 
 
 def registration_of(
-    cloud: LidarCloud, shown: FloatArray, views: DepthViews, seed: int, *, depths: bool = False
+    cloud: LidarCloud, surface_in_model: FloatArray, views: DepthViews, seed: int, *, depths: bool = False
 ) -> Registration:
     """Return the shift of a cloud against the depth maps of stereo; `depths`: it is of measured depth maps.
 
@@ -234,7 +234,7 @@ def registration_of(
         InputError: the cloud lies above or below the surface of the photographs by more than the search reaches,
             or the two have no surface in common.
     """
-    height_m, cells = _height_difference(cloud.position_in_model, shown)
+    height_m, cells = _height_difference(cloud.position_in_model, surface_in_model)
     if cells and abs(height_m) > _ANOTHER_DATUM_M:
         raise InputError(
             "lidar-height-offset",
@@ -280,7 +280,7 @@ def plane_observations(found: Registration, geo_from_model: Similarity) -> Plane
     )
 
 
-def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpace | None:
+def free_space(cloud: LidarCloud, gone: BoolArray, surface_in_model: FloatArray) -> FreeSpace | None:
     """Return the cells that beams have crossed and in which nothing is seen; None: no beam is known.
 
     Beams of points (P,) that are `gone` do not count. Where the photographs show a surface (S, 3), nothing is free;
@@ -299,7 +299,7 @@ def free_space(cloud: LidarCloud, gone: BoolArray, shown: FloatArray) -> FreeSpa
     shape = (np.ceil((high - low) / cell_m) + 1).astype(np.int64)
     count = count_beams(end[beams], cloud.scanner_in_model[beams], low, cell_m, shape)
     taken = np.zeros(shape, dtype=bool)
-    for points in (end, shown):
+    for points in (end, surface_in_model):
         cell = np.floor((points - low) / cell_m).astype(np.int64)
         cell = cell[((cell >= 0) & (cell < shape)).all(axis=1)]
         taken[tuple(cell.T)] = True
@@ -345,11 +345,11 @@ def _checked(
     return record
 
 
-def _height_difference(cloud: FloatArray, shown: FloatArray) -> tuple[float, int]:
+def _height_difference(cloud: FloatArray, surface_in_model: FloatArray) -> tuple[float, int]:
     """Return the median height of the cloud above the photographs' surface, and the number of cells compared."""
-    low = np.minimum(cloud.min(axis=0), shown.min(axis=0))[:2]
+    low = np.minimum(cloud.min(axis=0), surface_in_model.min(axis=0))[:2]
     medians = []
-    for points in (cloud, shown):
+    for points in (cloud, surface_in_model):
         cell = np.floor((points[:, :2] - low) / _HEIGHT_CELL_M).astype(np.int64)
         key = cell[:, 0] * 10_000_000 + cell[:, 1]
         order = np.lexsort((points[:, 2], key))

@@ -139,7 +139,7 @@ def tables_of(measurements: Sequence[NamedMeasurement]) -> dict[str, str]:
         heads = [f"{name}{part}" for name in names for part in ("", " sigma", " unit")]
         lines: list[Sequence[object]] = [["name", "wkt", "crs", *_PLACE, *heads]]
         for each in rows:
-            place = _place(each.points[0]) if kind == "point" else ("",) * len(_PLACE)
+            place = _place_cells(each.points[0]) if kind == "point" else ("",) * len(_PLACE)
             found = {quantity.name: quantity for quantity in each.quantities}
             values: list[object] = []
             for one in map(found.get, names):
@@ -151,7 +151,7 @@ def tables_of(measurements: Sequence[NamedMeasurement]) -> dict[str, str]:
     return tables
 
 
-def _place(point: SavedPoint) -> tuple[object, ...]:
+def _place_cells(point: SavedPoint) -> tuple[object, ...]:
     """Return the cells of the columns `_PLACE`; those of an unknown σ are empty."""
     return (*point.xyz, *(point.sigma_m or ("", "", "")))
 

@@ -66,7 +66,7 @@ def test_only_what_differs_is_copied(storage: Storage, tmp_path: Path, monkeypat
     write(tmp_path / "b/ws", {"sub/three": b"3"})
     (tmp_path / "b/ws/one").unlink()
     copied: list[str] = []
-    kind = type(storage._place("ws")[0])
+    kind = type(storage._folder_in_store("ws")[0])
     put_file = kind.put_file
     monkeypatch.setattr(
         kind,

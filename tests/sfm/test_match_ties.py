@@ -72,7 +72,7 @@ def test_matches_that_agree_tie_it() -> None:
     point = ground(80)
     found = tie(pycolmap, *views(point, np.arange(80) < 20), has_scale=False)
     assert isinstance(found, Tie)
-    assert np.linalg.norm(found.place.apply(np.zeros(3)) - TRUE) < 4 * found.sigma * HEIGHT_M
+    assert np.linalg.norm(found.model_from_part.apply(np.zeros(3)) - TRUE) < 4 * found.sigma * HEIGHT_M
 
 
 @pytest.mark.parametrize(

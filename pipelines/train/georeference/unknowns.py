@@ -74,7 +74,7 @@ class TensorSimilarity:
 class TensorPivot:
     """A pivot of the factor, `geometry.sparse_cholesky.Pivot`, as tensors."""
 
-    own: Tensor
+    eliminated: Tensor
     border: Tensor
     diagonal: Tensor
     below: Tensor
@@ -88,8 +88,8 @@ class _Coloured(torch.autograd.Function):
         ctx.pivots = pivots
         solution = torch.zeros_like(v)
         for pivot in reversed(pivots):
-            own = v[pivot.own] - pivot.below.T @ solution[pivot.border]
-            solution[pivot.own] = _solved(pivot.diagonal.T, own, upper=True)
+            own = v[pivot.eliminated] - pivot.below.T @ solution[pivot.border]
+            solution[pivot.eliminated] = _solved(pivot.diagonal.T, own, upper=True)
         return solution
 
     @staticmethod
@@ -97,8 +97,8 @@ class _Coloured(torch.autograd.Function):
         (gradient,) = gradients
         solution = gradient.clone()
         for pivot in ctx.pivots:
-            own = _solved(pivot.diagonal, solution[pivot.own], upper=False)
-            solution[pivot.own] = own
+            own = _solved(pivot.diagonal, solution[pivot.eliminated], upper=False)
+            solution[pivot.eliminated] = own
             solution[pivot.border] -= pivot.below @ own
         return solution, None
 
