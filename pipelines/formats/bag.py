@@ -33,6 +33,8 @@ _SAMPLE_LAG_US = 60_000_000
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _REPAIR = "repair it with `mcap recover` (mcap) or `ros2 bag reindex` (sqlite3, or metadata.yaml missing)"
 
+RosMessage = Any  # decoded; its fields are those of the definition of its type
+
 
 class UndecodableError(ValueError):
     """A message that does not fit its definition, or whose definition is unknown."""
@@ -296,7 +298,7 @@ class ImageWriter:
 
     bits: int | None = None
 
-    def encoded(self, kind: str, message: Any) -> tuple[bytes, str]:
+    def encoded(self, kind: str, message: RosMessage) -> tuple[bytes, str]:
         """Return the file's bytes and its suffix.
 
         Raises:
@@ -311,7 +313,7 @@ class ImageWriter:
             raise BadImageError("does not encode as PNG")
         return data.tobytes(), ".png"
 
-    def _pixels(self, message: Any) -> ByteArray:
+    def _pixels(self, message: RosMessage) -> ByteArray:
         encoding = str(message.encoding).strip().lower()
         if encoding not in _PIXEL_BYTES:
             raise BadImageError(f"encoding {message.encoding!r} is none of {', '.join(ENCODINGS)}")
@@ -332,7 +334,7 @@ class ImageWriter:
         return _to_bgr(raw, encoding)
 
 
-def _compressed(message: Any) -> tuple[bytes, str]:
+def _compressed(message: RosMessage) -> tuple[bytes, str]:
     data = np.asarray(message.data, dtype=np.uint8).tobytes()
     if len(data) > MAX_BYTES:
         raise BadImageError(f"has {len(data) / 2**20:.0f} MiB (limit {MAX_BYTES // 2**20})")

@@ -25,7 +25,7 @@ from pipelines.core.types import FloatArray, IntArray, Vector3
 from pipelines.core.validators import stays_inside
 from pipelines.formats.colmap_text import check_images_text
 from pipelines.formats.colmap_values import check_lenses, check_quaternions_text, quaternion_fault
-from pipelines.geometry.cameras import Camera, pycolmap_module
+from pipelines.geometry.cameras import Camera, Reconstruction, pycolmap_module
 from pipelines.geometry.sparse_model import SparseModel
 
 ROLLING_SHUTTER = "rolling_shutter.json"
@@ -198,7 +198,7 @@ def lens_of_colmap(camera: Any) -> Camera:
     return Camera(camera.model_name, int(camera.width), int(camera.height), np.array(camera.params, np.float64))
 
 
-def flatten(reconstruction: Any) -> SparseModel:
+def flatten(reconstruction: Reconstruction) -> SparseModel:
     """Return a `pycolmap.Reconstruction` as arrays; images without a pose and stray observations are left out."""
     cameras = {int(camera_id): lens_of_colmap(camera) for camera_id, camera in reconstruction.cameras.items()}
     images = [reconstruction.images[image_id] for image_id in sorted(reconstruction.reg_image_ids())]
@@ -236,7 +236,7 @@ def quiet_colmap() -> Iterator[Any]:
         pycolmap.logging.minloglevel = level
 
 
-def write_reconstruction(reconstruction: Any, folder: Path) -> None:
+def write_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:
     """Write a `pycolmap.Reconstruction` in COLMAP's binary form into a folder, made if missing, and read it back.
 
     COLMAP does not notice that a disk is full while it writes.

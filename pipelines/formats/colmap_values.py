@@ -7,9 +7,9 @@ quaternion of any, also of zeros, and says nothing.
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from pipelines.core.errors import InputError
+from pipelines.geometry.cameras import Reconstruction
 
 # Programs write quaternions with four decimals and more.
 _MOST_OFF_UNIT = 0.05
@@ -50,7 +50,7 @@ def _fault_in(line: str) -> str | None:
     return None if fault is None else f"The image {cells[9]!r} {fault}. Write its pose again."
 
 
-def check_lenses(reconstruction: Any, file: Path) -> None:
+def check_lenses(reconstruction: Reconstruction, file: Path) -> None:
     """Refuse a model with an image whose camera has no possible focal length; an InputError names the camera."""
     for camera_id in sorted({image.camera_id for image in reconstruction.images.values()}):
         camera = reconstruction.cameras[camera_id]

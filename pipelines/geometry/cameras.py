@@ -50,6 +50,10 @@ _MISSED_PX = (
     1e-3  # between a pixel and its ray's, beyond which the ray is another's; COLMAP's iteration leaves 1e-6
 )
 
+# Classes of pycolmap, by name: a file that mentions one does not load the library.
+Reconstruction = Any
+ColmapDatabase = Any
+
 
 def pycolmap_module() -> Any:
     """Return pycolmap, imported so that the process's signals stay as they are.

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pipelines.core.types import FloatArray, Quaternion, Vector3, vector3
+from pipelines.formats.bag import RosMessage
 from pipelines.geodesy.vertical import impossible_heights
 from pipelines.geometry.rotations import ENU_FROM_NED, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.trajectory import Trajectory
@@ -72,7 +73,7 @@ def body_axes(frame: str) -> Axes:
     return "optical" if "optical" in name else "flu"
 
 
-def stamp_ns(message: Any) -> int | None:
+def stamp_ns(message: RosMessage) -> int | None:
     """Return a message's own stamp in nanoseconds: its header's, or PX4's microseconds; None where it is zero."""
     header = getattr(message, "header", None)
     if header is not None:
@@ -81,7 +82,7 @@ def stamp_ns(message: Any) -> int | None:
     return int(sample) * 1000 or None
 
 
-def _fix(message: Any) -> PositionSample:
+def _fix(message: RosMessage) -> PositionSample:
     coordinates = (float(message.latitude), float(message.longitude), float(message.altitude))
     covariance = np.asarray(message.position_covariance, dtype=np.float64).reshape(3, 3)
     known = message.position_covariance_type != _COVARIANCE_UNKNOWN
@@ -97,7 +98,7 @@ def _fix(message: Any) -> PositionSample:
     )
 
 
-def _global_position(message: Any) -> PositionSample:
+def _global_position(message: RosMessage) -> PositionSample:
     coordinates = (float(message.lat), float(message.lon), float(message.alt_ellipsoid))
     flags = ("lat_lon_valid", "alt_valid", "alt_ellipsoid_valid")  # since px4_msgs 1.16
     valid = all(getattr(message, flag, True) for flag in flags)
@@ -107,7 +108,7 @@ def _global_position(message: Any) -> PositionSample:
     return PositionSample(coordinates, _eph_epv(message), BASE, problem=problem)
 
 
-def _sensor_gps(message: Any) -> PositionSample:
+def _sensor_gps(message: RosMessage) -> PositionSample:
     if hasattr(message, "latitude_deg"):
         coordinates = (message.latitude_deg, message.longitude_deg, message.altitude_ellipsoid_m)
     else:  # px4_msgs up to release 1.14: 1e-7 degrees and millimetres
@@ -130,7 +131,7 @@ def _geodetic_problem(coordinates: Sequence[float]) -> str:
     return IMPOSSIBLE_HEIGHT if impossible_heights(alt) else ""
 
 
-def _local(position: Any, message: Any, frame: str = "", covariance: Any = None) -> PositionSample:
+def _local(position: Any, message: RosMessage, frame: str = "", covariance: Any = None) -> PositionSample:
     values = np.array([position.x, position.y, position.z], dtype=np.float64)
     variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[0, 7, 14]]
     if str(message.header.frame_id).lower().endswith("_ned"):
@@ -140,7 +141,7 @@ def _local(position: Any, message: Any, frame: str = "", covariance: Any = None)
     return PositionSample(vector3(values), _sigmas(variance), frame or BASE, world=world, problem=problem)
 
 
-def _px4_local(message: Any) -> PositionSample:
+def _px4_local(message: RosMessage) -> PositionSample:
     if hasattr(message, "position"):
         ned = np.asarray(message.position, dtype=np.float64)
         variance = np.asarray(message.position_variance, np.float64)
@@ -163,32 +164,32 @@ def _sigmas(variance: Any) -> Vector3:
     return vector3(np.sqrt(values))
 
 
-def _eph_epv(message: Any) -> Vector3:
+def _eph_epv(message: RosMessage) -> Vector3:
     h, v = float(message.eph), float(message.epv)
     good = math.isfinite(h) and math.isfinite(v) and 0 < h < _LARGEST_SIGMA_M and 0 < v < _LARGEST_SIGMA_M
     return (h / math.sqrt(2.0), h / math.sqrt(2.0), v) if good else _NAN3
 
 
-def _px4_is_ned(message: Any) -> bool:
+def _px4_is_ned(message: RosMessage) -> bool:
     if hasattr(message, "pose_frame"):
         return bool(message.pose_frame == _POSE_FRAME_NED)
     return bool(message.local_frame == 0)
 
 
-def _imu(message: Any) -> AttitudeSample:
+def _imu(message: RosMessage) -> AttitudeSample:
     frame = message.header.frame_id
     covariance = np.asarray(message.orientation_covariance, dtype=np.float64)
     ned, unknown = body_axes(frame) == "frd", covariance[0] == -1.0
     return _attitude(message.orientation, covariance[[0, 4, 8]], frame or BASE, ned, unknown)
 
 
-def _pose(orientation: Any, message: Any, frame: str = "", covariance: Any = None) -> AttitudeSample:
+def _pose(orientation: Any, message: RosMessage, frame: str = "", covariance: Any = None) -> AttitudeSample:
     variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[21, 28, 35]]
     ned = str(message.header.frame_id).lower().endswith("_ned")
     return _attitude(orientation, variance, frame or BASE, ned)
 
 
-def _px4_odometry(message: Any) -> AttitudeSample:
+def _px4_odometry(message: RosMessage) -> AttitudeSample:
     attitude = _from_ned_frd(message.q, getattr(message, "orientation_variance", np.full(3, np.nan)))
     return attitude if _px4_is_ned(message) else replace(attitude, problem="its frame is not North-East-Down")
 
@@ -281,7 +282,7 @@ class Transforms:
     def __contains__(self, frame: str) -> bool:
         return frame in self._links or any(link.parent == frame for link in self._links.values())
 
-    def add(self, message: Any, *, static: bool) -> None:
+    def add(self, message: RosMessage, *, static: bool) -> None:
         """Add the links of a `TFMessage`; transforms that are not finite are counted in `refused`."""
         for transform in message.transforms:
             stamp, shift, turn = (

@@ -10,14 +10,13 @@ from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.formats.bag import BadImageError, Bag, ImageWriter, RawMessage, UndecodableError
+from pipelines.formats.bag import BadImageError, Bag, ImageWriter, RawMessage, RosMessage, UndecodableError
 from pipelines.formats.exif import PhotoTags
 from pipelines.formats.image_file import MAX_PIXELS, ImageFile, inspect_image
 from pipelines.geometry.rotations import log_so3, quat_xyzw_from_matrix
@@ -179,7 +178,7 @@ def lens_priors(
     return (fitted,), {photo.name: 1 for photo in photos}
 
 
-def _camera_prior(message: Any, rectified: bool) -> tuple[CameraPrior | None, str]:
+def _camera_prior(message: RosMessage, rectified: bool) -> tuple[CameraPrior | None, str]:
     """Return the calibration of a `CameraInfo` and a remark on it; no prior where it is not calibrated.
 
     Of rectified images `p` applies, and no distortion is left.
@@ -231,7 +230,7 @@ def _lens(name: str, lens: FloatArray) -> tuple[str, list[float]]:
     return "", []
 
 
-def _numbers(message: Any, name: str) -> FloatArray:
+def _numbers(message: RosMessage, name: str) -> FloatArray:
     """Return a field that ROS 2 writes in small letters, ROS 1 in capitals."""
     values = getattr(message, name, None)
     return np.asarray(getattr(message, name.upper()) if values is None else values, dtype=np.float64)

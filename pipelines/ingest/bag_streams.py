@@ -19,7 +19,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.products import Remark
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.formats.bag import COMPRESSED, IMAGE, INFO, Bag, BagTopic, RawMessage, UndecodableError
+from pipelines.formats.bag import COMPRESSED, IMAGE, INFO, Bag, BagTopic, RawMessage, RosMessage, UndecodableError
 from pipelines.ingest.bag_messages import ATTITUDES, POSITIONS, TRANSFORM_TYPES, Axes, Transforms, stamp_ns
 from pipelines.ingest.bag_sources import RECEIVER_TYPES, TOPIC_CHOICE, ClockShift, clock_shifts, ranked_receivers
 from pipelines.ingest.options import ALL_SENSORS, IngestOptions
@@ -392,7 +392,7 @@ def _frame(bag: Bag, message: RawMessage) -> str:
 
 
 def _add_navigation(
-    decoded: Any, message: RawMessage, positions: TopicSamples | None, attitudes: TopicSamples | None
+    decoded: RosMessage, message: RawMessage, positions: TopicSamples | None, attitudes: TopicSamples | None
 ) -> None:
     """Add a message to the positions, the attitudes, or both: one topic may have both."""
     if positions is not None and message.topic == positions.topic:

@@ -18,6 +18,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from pipelines.core.errors import ConvergenceError
 from pipelines.core.progress import SILENT, Progress, ProgressTask
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.formats.colmap import flatten
-from pipelines.geometry.cameras import project_each
+from pipelines.geometry.cameras import Reconstruction, project_each
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.geometry.statistics import CAUCHY_95, CAUCHY_SCALE2, cauchy_weight, median_chi2, rayleigh_sigma
 
@@ -54,8 +55,8 @@ _TRACKS_KEPT = 2000
 
 
 def adjust_finally(
-    colmap: Any,
-    model: Any,
+    colmap: ModuleType,
+    model: Reconstruction,
     *,
     fixes: Mapping[str, Vector3] | None = None,
     complete: Callable[[Any], None] | None = None,
@@ -117,7 +118,7 @@ def adjust_finally(
     model.update_point_3d_errors()
 
 
-def keep_few_tracks(model: Any, tracks: int) -> None:
+def keep_few_tracks(model: Reconstruction, tracks: int) -> None:
     """Leave a `pycolmap.Reconstruction` with points drawn until each image sees `tracks` of them, or all it has.
 
     Points are drawn at random, always the same: the longest tracks would lie in one part of the images.
@@ -133,7 +134,7 @@ def keep_few_tracks(model: Any, tracks: int) -> None:
             model.delete_point3D(int(flat.point_id[point]))
 
 
-def _follow(colmap: Any, model: Any, leader: Any) -> None:
+def _follow(colmap: ModuleType, model: Reconstruction, leader: Reconstruction) -> None:
     """Give a model the cameras of another one of the same images, and its points their place beside these."""
     before, after = (
         np.array([each.images[key].projection_center() for key in sorted(leader.reg_image_ids())])
@@ -151,7 +152,7 @@ def _follow(colmap: Any, model: Any, leader: Any) -> None:
             model.frames[key].rig_from_world = frame.rig_from_world
 
 
-def place_points(colmap: Any, model: Any, threads: int = -1) -> None:
+def place_points(colmap: ModuleType, model: Reconstruction, threads: int = -1) -> None:
     """Move the points of a `pycolmap.Reconstruction` to where its cameras see them, by robust least squares."""
     adjustment = colmap.BundleAdjustmentOptions()
     adjustment.print_summary = False
@@ -162,7 +163,7 @@ def place_points(colmap: Any, model: Any, threads: int = -1) -> None:
     _adjust_points(colmap, model, adjustment)
 
 
-def _adjust_points(colmap: Any, model: Any, adjustment: Any) -> None:
+def _adjust_points(colmap: ModuleType, model: Reconstruction, adjustment: Any) -> None:
     """Move points to where the cameras see them."""
     points_alone = deepcopy(adjustment)
     points_alone.refine_rig_from_world = points_alone.refine_principal_point = False
@@ -171,11 +172,11 @@ def _adjust_points(colmap: Any, model: Any, adjustment: Any) -> None:
     _adjust(colmap, model, points_alone)
 
 
-def _least_gain(model: Any) -> float:
+def _least_gain(model: Reconstruction) -> float:
     return min(_LEAST_GAIN / int(model.compute_num_observations()), _LEAST_GAIN_OF_FEW)
 
 
-def _adjust(colmap: Any, model: Any, adjustment: Any) -> None:
+def _adjust(colmap: ModuleType, model: Reconstruction, adjustment: Any) -> None:
     bundle = colmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         bundle.add_image(image_id)
@@ -189,7 +190,7 @@ def _adjust(colmap: Any, model: Any, adjustment: Any) -> None:
         )
 
 
-def hold_lenses_in_place(bundle: Any, model: Any) -> None:
+def hold_lenses_in_place(bundle: Any, model: Reconstruction) -> None:
     """Hold the lenses of rigs that are exactly at the place of the reference lens, in an adjustment (`rigs.py`)."""
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
@@ -197,7 +198,7 @@ def hold_lenses_in_place(bundle: Any, model: Any) -> None:
                 bundle.set_constant_sensor_from_rig_pose(sensor)
 
 
-def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
+def _free_principal_point(colmap: ModuleType, model: Reconstruction, adjustment: Any) -> bool:
     """Adjust with the principal point free, and return whether the result was accepted.
 
     A refused principal point is frozen where it was, and all other parameters are adjusted anew.
@@ -225,7 +226,7 @@ def _free_principal_point(colmap: Any, model: Any, adjustment: Any) -> bool:
 
 
 def _adjust_robustly(
-    colmap: Any, model: Any, adjustment: Any, task: ProgressTask, *, settled: bool = False
+    colmap: ModuleType, model: Reconstruction, adjustment: Any, task: ProgressTask, *, settled: bool = False
 ) -> None:
     """Adjust until the scale of the kernel is that of the adjustment before; once, if the cameras are settled."""
     adjustment.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
@@ -242,7 +243,7 @@ def _adjust_robustly(
         used_px = scale_px
 
 
-def residual_px(model: Any) -> FloatArray:
+def residual_px(model: Reconstruction) -> FloatArray:
     """Return the lengths (M,) of the residuals of all observations in pixels; NaN behind the camera."""
     flat = flatten(model)
     rotation = flat.rotation_cam_from_local[flat.obs_image]
@@ -261,8 +262,8 @@ _MOST_ITERATIONS = 50
 
 
 def position_adjuster(
-    colmap: Any,
-    model: Any,
+    colmap: ModuleType,
+    model: Reconstruction,
     positions: Sequence[tuple[Any, ArrayLike, ArrayLike]],
     *,
     iterations: int,
@@ -302,7 +303,11 @@ def position_adjuster(
 
 
 def remove_drift(
-    colmap: Any, model: Any, fixes: Mapping[str, Vector3], threads: int, progress: Progress = SILENT
+    colmap: ModuleType,
+    model: Reconstruction,
+    fixes: Mapping[str, Vector3],
+    threads: int,
+    progress: Progress = SILENT,
 ) -> float | None:
     """Adjust a `pycolmap.Reconstruction` in place with measured positions as priors.
 

@@ -13,6 +13,7 @@ import logging
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -277,7 +278,7 @@ def _job(stage: StageRun, survey: Survey, plan: ChunkPlan, chunk: Chunk) -> Job:
     )
 
 
-def join_chunks(colmap: Any, job: SfmJob, plan: ChunkPlan, partial: Path, progress: Progress) -> None:
+def join_chunks(colmap: ModuleType, job: SfmJob, plan: ChunkPlan, partial: Path, progress: Progress) -> None:
     """Copy the features and matches of all finished chunks into the database of the job, which is made anew.
 
     Raises:

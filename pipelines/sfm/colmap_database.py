@@ -9,6 +9,7 @@ import sqlite3
 from collections.abc import Iterable, Mapping
 from contextlib import closing
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from pipelines.core.errors import DamagedPartialError, InputError, storage_error
 from pipelines.core.files import remove, replace_file
 from pipelines.core.stages import SURVEY
 from pipelines.core.types import FloatArray, IntArray
+from pipelines.geometry.cameras import ColmapDatabase
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import CameraPrior, Survey
 
@@ -24,7 +26,9 @@ FEATURES = ("keypoints", "descriptors")
 MATCHES = ("matches", "two_view_geometries")
 
 
-def write_frame(colmap: Any, database: Path, survey: Survey, images: Iterable[int], options: SfmOptions) -> None:
+def write_frame(
+    colmap: ModuleType, database: Path, survey: Survey, images: Iterable[int], options: SfmOptions
+) -> None:
     """Write cameras and images (indices into the survey's) into a database, made if missing; present ones stay.
 
     Raises:
@@ -47,7 +51,7 @@ def write_frame(colmap: Any, database: Path, survey: Survey, images: Iterable[in
             opened.write_frame(frame, use_frame_id=True)
 
 
-def rename_images(colmap: Any, path: Path, names: dict[str, str]) -> None:
+def rename_images(colmap: ModuleType, path: Path, names: dict[str, str]) -> None:
     """Rename those images of a database whose names are keys of `names`."""
     with colmap.Database.open(path) as database, colmap.DatabaseTransaction(database):
         for image in database.read_all_images():
@@ -99,7 +103,7 @@ def copy_database(source: Path, target: Path) -> None:
 
 
 def add_features(
-    colmap: Any,
+    colmap: ModuleType,
     path: Path,
     places: Mapping[int, FloatArray],
     matches: Mapping[tuple[int, int], IntArray],
@@ -126,7 +130,7 @@ def add_features(
         _write_matches(database, shifted)
 
 
-def add_matches(colmap: Any, path: Path, matches: Mapping[tuple[int, int], IntArray]) -> None:
+def add_matches(colmap: ModuleType, path: Path, matches: Mapping[tuple[int, int], IntArray]) -> None:
     """Add matches of features to those in a database; pairs that get some wait to be verified again.
 
     `matches` are rows (M, 2) of the features of each pair of the photographs' indices in the survey.
@@ -135,7 +139,7 @@ def add_matches(colmap: Any, path: Path, matches: Mapping[tuple[int, int], IntAr
         _write_matches(database, matches)
 
 
-def _write_matches(database: Any, matches: Mapping[tuple[int, int], IntArray]) -> None:
+def _write_matches(database: ColmapDatabase, matches: Mapping[tuple[int, int], IntArray]) -> None:
     for (a, b), rows in matches.items():
         before = np.zeros((0, 2), dtype=np.uint32)
         if database.exists_matches(a + 1, b + 1):
@@ -148,7 +152,7 @@ def _write_matches(database: Any, matches: Mapping[tuple[int, int], IntArray]) -
         database.write_matches(a + 1, b + 1, both[np.sort(kept)])
 
 
-def has_added_features(colmap: Any, path: Path) -> bool:
+def has_added_features(colmap: ModuleType, path: Path) -> bool:
     """Return whether a photograph of a database has features that `add_features` has added."""
     with colmap.Database.open(path) as database:
         return bool(database.num_keypoints() > database.num_descriptors())
@@ -163,7 +167,7 @@ def drop_added_features(path: Path) -> None:
         )
 
 
-def verified_matches(colmap: Any, path: Path) -> dict[tuple[int, int], int]:
+def verified_matches(colmap: ModuleType, path: Path) -> dict[tuple[int, int], int]:
     """Return the numbers of verified matches of the pairs of a database: indices i < j of the survey's images."""
     found = {}
     with colmap.Database.open(path) as database:
@@ -208,7 +212,7 @@ def require_sound(database: Path) -> None:
         raise DamagedPartialError("database-damaged", f"The database is damaged: {verdict}", path=database)
 
 
-def _write_camera(colmap: Any, database: Any, prior: CameraPrior, options: SfmOptions) -> None:
+def _write_camera(colmap: ModuleType, database: ColmapDatabase, prior: CameraPrior, options: SfmOptions) -> None:
     """Write a camera, and the rig that consists of it alone and has its number."""
     # No perspective model approximates a fisheye: its own model is kept.
     model = prior.model if prior.model == "OPENCV_FISHEYE" else options.camera_model
@@ -223,7 +227,7 @@ def _write_camera(colmap: Any, database: Any, prior: CameraPrior, options: SfmOp
     database.write_rig(rig, use_rig_id=True)
 
 
-def _copy_shared_params(colmap: Any, prior: CameraPrior, camera: Any) -> None:
+def _copy_shared_params(colmap: ModuleType, prior: CameraPrior, camera: Any) -> None:
     try:
         original = colmap.Camera(
             model=prior.model, width=prior.width, height=prior.height, params=list(prior.params)

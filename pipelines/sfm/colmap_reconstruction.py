@@ -3,6 +3,7 @@
 import logging
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from pipelines.core.errors import DegenerateGeometryError, InputError, ResourceError
@@ -12,6 +13,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.stages import RIG_MODEL
 from pipelines.core.workspace import StageRun
 from pipelines.formats.colmap import ROLLING_SHUTTER, quiet_colmap, write_reconstruction
+from pipelines.geometry.cameras import Reconstruction
 from pipelines.sfm.adjustment import adjust_finally
 from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks, remove_chunks, work_in_chunks
 from pipelines.sfm.colmap_database import require_sound
@@ -70,7 +72,7 @@ class ColmapReconstructor:
         return model
 
 
-def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> tuple[Any, bool]:
+def reconstruct(colmap: ModuleType, job: SfmJob, progress: Progress) -> tuple[Any, bool]:
     """Return the largest `pycolmap.Reconstruction` of the photographs, adjusted, and whether its lens is held.
 
     Raises:
@@ -93,7 +95,7 @@ def reconstruct(colmap: Any, job: SfmJob, progress: Progress) -> tuple[Any, bool
     return map_matches(colmap, job, progress)
 
 
-def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> tuple[Any, bool]:
+def map_matches(colmap: ModuleType, job: SfmJob, progress: Progress) -> tuple[Any, bool]:
     """Return the largest model of a database with features and matches, adjusted, and whether its lens is held.
 
     Raises as `reconstruct`. A held lens stays as stated in every later adjustment, too.
@@ -137,6 +139,6 @@ def map_matches(colmap: Any, job: SfmJob, progress: Progress) -> tuple[Any, bool
     return model, lens_held
 
 
-def _adjust(colmap: Any, job: SfmJob, model: Any, **how: Any) -> None:
+def _adjust(colmap: ModuleType, job: SfmJob, model: Reconstruction, **how: Any) -> None:
     free, threads = job.options.principal_point, chosen_threads(job.options.threads)
     adjust_finally(colmap, model, principal_point=free, threads=threads, **how)

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import flatten, load_reconstruction
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, lla_of
+from pipelines.geometry.cameras import ColmapDatabase, Reconstruction
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.sfm.colmap_database import FEATURES, copy_rows, drop_added_features, remove_database
@@ -121,7 +123,9 @@ class SolvedDate:
             raise InputError("earlier-apart", message, path=self.workspace.root, field="--earlier")
 
 
-def tie_to_earlier(colmap: Any, job: SfmJob, model: Any, earlier: SolvedDate, progress: Progress) -> CommonPoints:
+def tie_to_earlier(
+    colmap: ModuleType, job: SfmJob, model: Reconstruction, earlier: SolvedDate, progress: Progress
+) -> CommonPoints:
     """Return the points that a `pycolmap.Reconstruction` has in common with an earlier date.
 
     Raises:
@@ -149,7 +153,7 @@ def tie_to_earlier(colmap: Any, job: SfmJob, model: Any, earlier: SolvedDate, pr
     return points
 
 
-def pairs_across(survey: Survey, model: Any, earlier: SolvedDate) -> list[tuple[int, int]]:
+def pairs_across(survey: Survey, model: Reconstruction, earlier: SolvedDate) -> list[tuple[int, int]]:
     """Return the pairs (later image id, index of an earlier camera) that may show the same place.
 
     Few pairs are all taken. Otherwise, half of a photograph's partners are the nearest that look in a similar
@@ -293,7 +297,7 @@ class _BothDates:
     earlier_ids: IntArray  # of the earlier cameras, in their order
     known: dict[int, IntArray] = field(default_factory=dict)  # points of the features of images
 
-    def matched(self, colmap: Any, job: SfmJob, pairs: list[tuple[int, int]], progress: Progress) -> _Ties:
+    def matched(self, colmap: ModuleType, job: SfmJob, pairs: list[tuple[int, int]], progress: Progress) -> _Ties:
         """Match pairs (later image id, index of an earlier camera), and return the tracks that they tie."""
         matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
         matching.num_threads = chosen_threads(job.options.threads)
@@ -313,7 +317,7 @@ class _BothDates:
             votes.update(of_pair)
         return _one_to_one(votes, sum(matches for _, matches in found))
 
-    def _tied(self, database: Any, a: int, b: int) -> tuple[set[tuple[int, int]], int]:
+    def _tied(self, database: ColmapDatabase, a: int, b: int) -> tuple[set[tuple[int, int]], int]:
         """Return the pairs of points (later, earlier) that two images tie, and their number of verified matches."""
         rows = np.asarray(database.read_two_view_geometry(a, b).inlier_matches, dtype=np.int64).reshape(-1, 2)
         if len(rows) < _LEAST_MATCHES:
@@ -354,7 +358,9 @@ def _is_best(pair: tuple[int, int], best: tuple[dict[int, tuple[int, int]], ...]
 
 
 @contextmanager
-def _both_dates(colmap: Any, job: SfmJob, model: Any, earlier: SolvedDate) -> Iterator[_BothDates]:
+def _both_dates(
+    colmap: ModuleType, job: SfmJob, model: Reconstruction, earlier: SolvedDate
+) -> Iterator[_BothDates]:
     """Make a database of the registered photographs of both dates with their features; it is removed at the end."""
     path = job.database.with_name("dates.db")
     other = load_reconstruction(earlier.workspace.path(SPARSE))
@@ -377,7 +383,9 @@ def _both_dates(colmap: Any, job: SfmJob, model: Any, earlier: SolvedDate) -> It
         remove_database(path)
 
 
-def _write_images(colmap: Any, database: Any, model: Any, first: int, cameras: int) -> None:
+def _write_images(
+    colmap: ModuleType, database: ColmapDatabase, model: Reconstruction, first: int, cameras: int
+) -> None:
     """Write the solved cameras and the registered images of a model, their ids moved, into a database."""
     for camera in model.cameras.values():
         moved = colmap.Camera(

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -145,7 +146,7 @@ def _pairs_of_rigs(survey: Survey, options: SfmOptions) -> IntArray:
     return np.array(ordered, dtype=np.int64).reshape(-1, 2)
 
 
-def extract_features(colmap: Any, job: SfmJob, images: Sequence[int], progress: Progress) -> None:
+def extract_features(colmap: ModuleType, job: SfmJob, images: Sequence[int], progress: Progress) -> None:
     """Detect the features of photographs, given as indices, and write them into the database.
 
     Raises:
@@ -184,7 +185,7 @@ def extract_features(colmap: Any, job: SfmJob, images: Sequence[int], progress: 
                 task.advance(len(step))
 
 
-def match_features(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress) -> None:
+def match_features(colmap: ModuleType, job: SfmJob, pairs: IntArray, progress: Progress) -> None:
     """Match pairs (P, 2) of photographs whose features are in the database, and verify the matches."""
     matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
     matching.num_threads = chosen_threads(job.options.threads)
@@ -196,7 +197,7 @@ def match_features(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress
     _by_pairs(colmap, job, pairs, match, progress.task("matching", len(pairs)))
 
 
-def verify_matches(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress) -> None:
+def verify_matches(colmap: ModuleType, job: SfmJob, pairs: IntArray, progress: Progress) -> None:
     """Verify the matches of pairs (P, 2) that are in the database."""
 
     def verify(listing: Path) -> None:
@@ -205,7 +206,7 @@ def verify_matches(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress
     _by_pairs(colmap, job, pairs, verify, progress.task("verification", len(pairs)))
 
 
-def verification(colmap: Any, job: SfmJob) -> Any:
+def verification(colmap: ModuleType, job: SfmJob) -> Any:
     """Return COLMAP's options of the geometric verification of a pair, with the job's seed."""
     options = colmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job.options.seed
@@ -214,7 +215,7 @@ def verification(colmap: Any, job: SfmJob) -> Any:
 
 
 def _by_pairs(
-    colmap: Any,
+    colmap: ModuleType,
     job: SfmJob,
     pairs: IntArray,
     work: Callable[[Path], None],
@@ -239,7 +240,7 @@ def _by_pairs(
     listing.unlink(missing_ok=True)
 
 
-def _restore_names(colmap: Any, job: SfmJob) -> None:
+def _restore_names(colmap: ModuleType, job: SfmJob) -> None:
     """Restore the names of images; a run that was killed while it matched has left numbers in their place."""
     names = [image.name for image in job.survey.images]
     rename_images(colmap, job.database, {_number(index): name for index, name in enumerate(names)})

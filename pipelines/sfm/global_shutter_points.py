@@ -12,6 +12,7 @@ import numpy as np
 
 from pipelines.core.types import FloatArray, IntArray, vector3
 from pipelines.formats.colmap import RollingShutter, flatten
+from pipelines.geometry.cameras import Reconstruction
 from pipelines.geometry.rolling_shutter import in_global_shutter
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.sfm.adjustment import alignment_with
@@ -25,7 +26,7 @@ _LEAST_PX = 0.05  # largest motion of a row in the image that is worth a correct
 
 
 def correct_tie_points(
-    model: Any, survey: Survey, adjust: Callable[[Any], None]
+    model: Reconstruction, survey: Survey, adjust: Callable[[Any], None]
 ) -> tuple[Any, RollingShutter | None]:
     """Return a `pycolmap.Reconstruction` with corrected observations, adjusted, and the motion of its cameras.
 
@@ -63,7 +64,7 @@ def correct_tie_points(
     return corrected, RollingShutter(travel_in_cam={name: vector3(along) for name, along in motion})
 
 
-def _observed(model: Any) -> dict[int, tuple[IntArray, FloatArray]]:
+def _observed(model: Reconstruction) -> dict[int, tuple[IntArray, FloatArray]]:
     """Return places and pixels of the points that each registered image observes, in the order of `flatten`."""
     seen = {}
     for image_id in sorted(model.reg_image_ids()):

@@ -9,6 +9,7 @@ accuracy by two. From three on, the cameras' own errors are the larger ones.
 
 import logging
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from pipelines.core.errors import ConvergenceError
 from pipelines.core.progress import Progress
 from pipelines.core.types import FloatArray
+from pipelines.geometry.cameras import Reconstruction
 from pipelines.geometry.statistics import cauchy_loss, rayleigh_sigma
 from pipelines.sfm.adjustment import LEAST_SCALE_PX, adjust_finally, place_points, residual_px
 
@@ -29,8 +31,8 @@ _BEHIND_SIGMA = 1e3  # length of the residual of a point behind its camera
 
 
 def settle_imported(
-    colmap: Any,
-    model: Any,
+    colmap: ModuleType,
+    model: Reconstruction,
     rule: Rule,
     *,
     again: Callable[[Any], Any] | None = None,
@@ -83,7 +85,9 @@ def settle_imported(
     return freed if lens else better
 
 
-def _in_rounds(colmap: Any, model: Any, again: Callable[[Any], Any], threads: int, progress: Progress) -> Any:
+def _in_rounds(
+    colmap: ModuleType, model: Reconstruction, again: Callable[[Any], Any], threads: int, progress: Progress
+) -> Any:
     """Return the model triangulated and adjusted by turns, until the number of its observations settles."""
     observations = 0
     for _ in range(_MOST_ROUNDS):
@@ -111,7 +115,7 @@ def _warn(code: str, sentence: str, before_px: float, after_px: float, gain: flo
     log.warning(_FIT + sentence, before_px, after_px, gain, extra={"code": code})
 
 
-def _redundant(model: Any) -> bool:
+def _redundant(model: Reconstruction) -> bool:
     """Return whether the observations determine poses, lenses and points."""
     lenses = sum(len(camera.params) for camera in model.cameras.values())
     unknowns = 6 * model.num_reg_images() + 3 * model.num_points3D() + lenses

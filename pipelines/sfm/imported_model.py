@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
+from types import ModuleType
 from typing import Any, Self
 
 from pipelines.core.errors import InputError
@@ -19,6 +20,7 @@ from pipelines.formats.colmap import (
     write_reconstruction,
 )
 from pipelines.formats.solved_cameras import PhotoSize
+from pipelines.geometry.cameras import Reconstruction
 from pipelines.sfm.chunks import remove_chunks
 from pipelines.sfm.colmap_reconstruction import ColmapReconstructor
 from pipelines.sfm.estimate import ReconstructionEstimate, estimate_reconstruction
@@ -99,7 +101,7 @@ class ImportedModel:
             return "adjust" if options.adjust_imported == "yes" else "hold"
         return "judge" if self.foreign and not options.triangulate else "hold"
 
-    def _settled(self, colmap: Any, model: Any, job: SfmJob, progress: Progress) -> Any:
+    def _settled(self, colmap: ModuleType, model: Reconstruction, job: SfmJob, progress: Progress) -> Any:
         """Return the model, adjusted where options and tie points say so; COLMAP's own stays as it is, unjudged."""
         if job.options.adjust_imported == "auto" and not self.triangulates and not self.foreign:
             return model
@@ -187,7 +189,7 @@ def _photo_sizes(survey: Survey) -> dict[str, tuple[int, int]]:
     return {image.name: (priors[image.camera_id].width, priors[image.camera_id].height) for image in survey.images}
 
 
-def _rename(model: Any, survey: Survey, folder: Path, warn: Callable[..., None]) -> list[Any]:
+def _rename(model: Reconstruction, survey: Survey, folder: Path, warn: Callable[..., None]) -> list[Any]:
     """Give the posed images of a model their names in the survey; return those that are none of its images.
 
     Raises:
@@ -224,7 +226,7 @@ def _relative(name: str) -> str:
     return pure.name if pure.is_absolute() or ".." in pure.parts or name[1:2] == ":" else name
 
 
-def _require_observations(model: Any, folder: Path) -> None:
+def _require_observations(model: Reconstruction, folder: Path) -> None:
     """Refuse a model of poses alone; leave out single images without observations.
 
     Raises:
@@ -294,7 +296,7 @@ def _number_of_images(folder: Path) -> int:
         return 0
 
 
-def _check_cameras(model: Any, survey: Survey, folder: Path, warn: Callable[..., None]) -> None:
+def _check_cameras(model: Reconstruction, survey: Survey, folder: Path, warn: Callable[..., None]) -> None:
     size_of = _photo_sizes(survey)
     flat = set()
     for image_id in model.reg_image_ids():

@@ -10,12 +10,14 @@
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress, ProgressTask
+from pipelines.geometry.cameras import ColmapDatabase, Reconstruction
 from pipelines.geometry.statistics import CAUCHY_95
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.mapping import MapperRun, replaced_lens, run_mapper, scratch_beside
@@ -41,7 +43,9 @@ class Join:
     tie: Tie
 
 
-def join_by_matches(colmap: Any, job: SfmJob, whole: Any, progress: Progress) -> tuple[Any, tuple[Join, ...]]:
+def join_by_matches(
+    colmap: ModuleType, job: SfmJob, whole: Reconstruction, progress: Progress
+) -> tuple[Any, tuple[Join, ...]]:
     """Return a `pycolmap.Reconstruction` of the incremental mapper, with what its matches tie to it, and the joins.
 
     The given model stays as it is.
@@ -63,7 +67,7 @@ def join_by_matches(colmap: Any, job: SfmJob, whole: Any, progress: Progress) ->
 
 
 def _join_some(
-    colmap: Any, job: SfmJob, whole: Any, parts: list[Any], task: ProgressTask
+    colmap: ModuleType, job: SfmJob, whole: Reconstruction, parts: list[Any], task: ProgressTask
 ) -> tuple[Any, list[Join]]:
     """Return the model with those parts that are tied to it as it is now, and their joins."""
     joins = []
@@ -87,7 +91,7 @@ def _join_some(
     return whole, joins
 
 
-def _tied(colmap: Any, job: SfmJob, whole: Any, part: Any) -> Tie | str:
+def _tied(colmap: ModuleType, job: SfmJob, whole: Reconstruction, part: Reconstruction) -> Tie | str:
     pairs = _pairs_across(colmap, job.database, whole, part)
     if not pairs:
         return "no photograph of it matches the model"
@@ -97,7 +101,7 @@ def _tied(colmap: Any, job: SfmJob, whole: Any, part: Any) -> Tie | str:
     return tie(colmap, model, theirs, has_scale=part.num_reg_frames() > 1, seed=job.options.seed)
 
 
-def _pairs_across(colmap: Any, database: Path, whole: Any, part: Any = None) -> Pairs:
+def _pairs_across(colmap: ModuleType, database: Path, whole: Reconstruction, part: Reconstruction = None) -> Pairs:
     """Return the verified matches, rows (N, 2) of features, of photographs outside a model with those in it.
 
     The keys are COLMAP's numbers of the two. With `part`, the photographs outside are those of another model.
@@ -117,7 +121,7 @@ def _pairs_across(colmap: Any, database: Path, whole: Any, part: Any = None) -> 
     return found
 
 
-def _models_apart(colmap: Any, job: SfmJob, whole: Any) -> list[Any]:
+def _models_apart(colmap: ModuleType, job: SfmJob, whole: Reconstruction) -> list[Any]:
     """Return models of the photographs that are not in a model, with its lens held."""
     inside = set(whole.reg_image_ids())
     names = [image.name for index, image in enumerate(job.survey.images) if index + 1 not in inside]
@@ -131,7 +135,7 @@ def _models_apart(colmap: Any, job: SfmJob, whole: Any) -> list[Any]:
         return run_mapper(colmap, "incremental", run, lambda: None)
 
 
-def _photographs_apart(colmap: Any, job: SfmJob, whole: Any) -> list[Any]:
+def _photographs_apart(colmap: ModuleType, job: SfmJob, whole: Reconstruction) -> list[Any]:
     """Return a model of each photograph that matches a model and is not in it, those with most matches first."""
     matches: dict[int, int] = {}
     for (one, _), rows in _pairs_across(colmap, job.database, whole).items():
@@ -143,7 +147,7 @@ def _photographs_apart(colmap: Any, job: SfmJob, whole: Any) -> list[Any]:
     return [model for model in alone if model is not None]
 
 
-def _model_of_one(colmap: Any, database: Any, whole: Any, image_id: int) -> Any:
+def _model_of_one(colmap: ModuleType, database: ColmapDatabase, whole: Reconstruction, image_id: int) -> Any:
     """Return a model of one photograph, in its own frame; None: its camera is one of several of a rig."""
     stored = database.read_image(image_id)
     rig = database.read_rig_with_sensor(stored.data_id.sensor_id)
@@ -167,7 +171,7 @@ def _model_of_one(colmap: Any, database: Any, whole: Any, image_id: int) -> Any:
     return model
 
 
-def _settle(colmap: Any, job: SfmJob, whole: Any, images: list[int]) -> int:
+def _settle(colmap: ModuleType, job: SfmJob, whole: Reconstruction, images: list[int]) -> int:
     """Triangulate and adjust photographs that have joined a model, in place; the number of points they share."""
     with colmap.Database.open(job.database) as opened:
         cache = colmap.DatabaseCache.create(opened, colmap.DatabaseCacheOptions())
@@ -186,7 +190,7 @@ def _settle(colmap: Any, job: SfmJob, whole: Any, images: list[int]) -> int:
     return sum(bool(track & new) and not track <= new for track in tracks)
 
 
-def _adjust_part(colmap: Any, job: SfmJob, whole: Any, images: list[int]) -> None:
+def _adjust_part(colmap: ModuleType, job: SfmJob, whole: Reconstruction, images: list[int]) -> None:
     """Adjust photographs to those of the model that they share points with, which stay where they are."""
     new, beside = set(images), set()
     for point in whole.points3D.values():

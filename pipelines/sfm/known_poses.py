@@ -1,6 +1,7 @@
 """Triangulation from known poses: points of a model whose poses come from elsewhere and stay as they are."""
 
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import load_json
 from pipelines.core.progress import Progress
 from pipelines.formats.colmap import flatten
+from pipelines.geometry.cameras import ColmapDatabase, Reconstruction
 from pipelines.sfm.chunks import PLAN, ChunkPlan, join_chunks
 from pipelines.sfm.colmap_database import require_sound
 from pipelines.sfm.features import SfmJob, candidate_pairs, extract_features, match_features
@@ -21,7 +23,7 @@ _LIMIT_OF_EPIPOLAR = 8.0  # times the median distance of matches: nearly all tha
 
 
 def triangulated_from(
-    colmap: Any, imported: Any, job: SfmJob, folder: Path, progress: Progress, *, held: bool
+    colmap: ModuleType, imported: Reconstruction, job: SfmJob, folder: Path, progress: Progress, *, held: bool
 ) -> Any:
     """Return a model with poses and lenses of an imported `pycolmap.Reconstruction`, and points without colour.
 
@@ -50,7 +52,7 @@ def triangulated_from(
     return model
 
 
-def triangulated_again(colmap: Any, model: Any, database: Path, progress: Progress) -> Any:
+def triangulated_again(colmap: ModuleType, model: Reconstruction, database: Path, progress: Progress) -> Any:
     """Return the cameras of a `pycolmap.Reconstruction` of this database with points triangulated anew.
 
     The limit of an observation follows the distances of the matches from their epipolar lines: with COLMAP's own,
@@ -63,11 +65,11 @@ def triangulated_again(colmap: Any, model: Any, database: Path, progress: Progre
     return bare
 
 
-def _limit_px(model: Any, matches: Matches) -> float:
+def _limit_px(model: Reconstruction, matches: Matches) -> float:
     return max(_LIMIT_PX, _LIMIT_OF_EPIPOLAR * epipolar_error_px(flatten(model), matches))
 
 
-def _without_points(model: Any, matches: int, pairs: int) -> DegenerateGeometryError:
+def _without_points(model: Reconstruction, matches: int, pairs: int) -> DegenerateGeometryError:
     """Return the error of poses that give hardly a point: the photographs or the poses are the cause."""
     found = f"{model.num_points3D()} points could be triangulated from the imported poses"
     if matches < _LEAST_POINTS:
@@ -86,7 +88,7 @@ def _without_points(model: Any, matches: int, pairs: int) -> DegenerateGeometryE
     )
 
 
-def _with_numbers_of(colmap: Any, imported: Any, database: Path) -> Any:
+def _with_numbers_of(colmap: ModuleType, imported: Reconstruction, database: Path) -> Any:
     """Return the posed images of a model, without points, with their numbers in a database, which gets the cameras.
 
     COLMAP requires that images have the same cameras in a model and in its database.
@@ -116,7 +118,7 @@ def _with_numbers_of(colmap: Any, imported: Any, database: Path) -> Any:
     return model
 
 
-def _matches(colmap: Any, model: Any, database: Path) -> Matches:
+def _matches(colmap: ModuleType, model: Reconstruction, database: Path) -> Matches:
     """Return pixels of the verified matches between the posed images, by rows of the flat model."""
     row_of = {int(image_id): row for row, image_id in enumerate(sorted(model.reg_image_ids()))}
     found = {}
@@ -132,7 +134,7 @@ def _matches(colmap: Any, model: Any, database: Path) -> Matches:
     return found
 
 
-def _geometries(colmap: Any, opened: Any) -> list[tuple[tuple[int, int], Any]]:
+def _geometries(colmap: ModuleType, opened: ColmapDatabase) -> list[tuple[tuple[int, int], Any]]:
     pair_ids, geometries = opened.read_two_view_geometries()
     pairs = [tuple(colmap.pair_id_to_image_pair(pair_id)) for pair_id in pair_ids]
     return list(zip(pairs, geometries, strict=True))

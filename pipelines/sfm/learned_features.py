@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -140,7 +141,7 @@ class LearnedMatcher:
         }
 
 
-def add_learned(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress) -> int:
+def add_learned(colmap: ModuleType, job: SfmJob, pairs: IntArray, progress: Progress) -> int:
     """Add learned features of the photographs of some pairs (P, 2), and their matches, to those in the database.
 
     Returns:

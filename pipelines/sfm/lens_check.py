@@ -4,18 +4,16 @@ A model of few photographs, or of flat ground seen from above, fits its observat
 carries. Whoever measures in it is wrong by as much, and photographs that would fit the true lens are refused.
 """
 
-from typing import Any
-
 import numpy as np
 
 from pipelines.formats.colmap import lens_of_colmap
-from pipelines.geometry.cameras import Camera, undistort
+from pipelines.geometry.cameras import Camera, Reconstruction, undistort
 from pipelines.survey.survey import FOCAL_DIFFERS, Survey
 
 _RIM = 0.98  # of the image's half sides: at the corners themselves few points lie
 
 
-def lenses_astray(model: Any, survey: Survey) -> dict[int, str]:
+def lenses_astray(model: Reconstruction, survey: Survey) -> dict[int, str]:
     """Return the cameras of a `pycolmap.Reconstruction` whose lens cannot be, each with the reason for people."""
     used = {model.images[image_id].camera_id for image_id in model.reg_image_ids()}
     priors = {prior.camera_id: prior for prior in survey.cameras}

@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress
+from pipelines.geometry.cameras import ColmapDatabase, Reconstruction
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.options import SfmOptions
 
@@ -51,7 +53,7 @@ def chosen_mapper(photographs: int, options: SfmOptions) -> MapperName:
 
 
 def map_database(
-    colmap: Any, job: SfmJob, progress: Progress, *, lens_held: bool = False
+    colmap: ModuleType, job: SfmJob, progress: Progress, *, lens_held: bool = False
 ) -> tuple[list[Any], MapperName]:
     """Return the models (`pycolmap.Reconstruction`) of a database with features and matches, the largest first, and
     their mapper.
@@ -74,7 +76,7 @@ def map_database(
     return models, mapper
 
 
-def run_mapper(colmap: Any, mapper: MapperName, run: MapperRun, registered: Callable[[], None]) -> list[Any]:
+def run_mapper(colmap: ModuleType, mapper: MapperName, run: MapperRun, registered: Callable[[], None]) -> list[Any]:
     """Return the models of a mapper, the largest first; those of the global mapper have few tracks.
 
     The incremental mapper calls `registered` when it has registered a photograph.
@@ -103,7 +105,9 @@ def run_mapper(colmap: Any, mapper: MapperName, run: MapperRun, registered: Call
     return [model for *_, model in sorted(size, key=lambda row: row[:2], reverse=True)]
 
 
-def _models(colmap: Any, mapper: MapperName, job: SfmJob, progress: Progress, *, lens_held: bool) -> list[Any]:
+def _models(
+    colmap: ModuleType, mapper: MapperName, job: SfmJob, progress: Progress, *, lens_held: bool
+) -> list[Any]:
     title = "global mapping" if mapper == "global" else "mapping"
     title += ", lens held" if lens_held else ""
     with progress.task(title, len(job.survey.images)) as task, scratch_beside(job.database) as scratch:
@@ -116,7 +120,7 @@ def _models(colmap: Any, mapper: MapperName, job: SfmJob, progress: Progress, *,
 
 
 @contextmanager
-def replaced_lens(colmap: Any, path: Path, params: Mapping[int, Any]) -> Iterator[None]:
+def replaced_lens(colmap: ModuleType, path: Path, params: Mapping[int, Any]) -> Iterator[None]:
     """Give cameras in a database other parameters for a while."""
     with colmap.Database.open(path) as database:
         stated = {camera.camera_id: camera for camera in database.read_all_cameras() if camera.camera_id in params}
@@ -129,14 +133,14 @@ def replaced_lens(colmap: Any, path: Path, params: Mapping[int, Any]) -> Iterato
             _write_params(database, stated, before)
 
 
-def _write_params(database: Any, cameras: Mapping[int, Any], params: Mapping[int, Any]) -> None:
+def _write_params(database: ColmapDatabase, cameras: Mapping[int, Any], params: Mapping[int, Any]) -> None:
     for camera_id, camera in cameras.items():
         camera.params = params[camera_id]
         database.update_camera(camera)
 
 
 def triangulate(
-    colmap: Any, model: Any, database: Path, progress: Progress, *, limit_px: float | None = None
+    colmap: ModuleType, model: Reconstruction, database: Path, progress: Progress, *, limit_px: float | None = None
 ) -> None:
     """Add the tracks of a database to a `pycolmap.Reconstruction` of known cameras, in place.
 

@@ -14,13 +14,14 @@ Together they determine the similarity model ← part. It counts only if they de
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Self
+from types import ModuleType
+from typing import Self
 
 import numpy as np
 
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.formats.colmap import lens_of_colmap
-from pipelines.geometry.cameras import Camera, bearings, project_each
+from pipelines.geometry.cameras import Camera, Reconstruction, bearings, project_each
 from pipelines.geometry.similarity import Similarity, covariance_at, perturbation
 from pipelines.geometry.statistics import CAUCHY_95, NORMAL_MAD, cauchy_weight
 
@@ -94,7 +95,7 @@ class Tie:
     points: int  # matches of points of the model
 
 
-def side_of(model: Any, image: Sequence[int], row: Sequence[int]) -> Side:
+def side_of(model: Reconstruction, image: Sequence[int], row: Sequence[int]) -> Side:
     """Return matches (M,), features given by image and row, as parts of a `pycolmap.Reconstruction`."""
     cameras = {key: lens_of_colmap(each) for key, each in model.cameras.items()}
     images = {key: model.images[key] for key in set(image)}
@@ -121,7 +122,7 @@ def side_of(model: Any, image: Sequence[int], row: Sequence[int]) -> Side:
     )
 
 
-def tie(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed: int = 0) -> Tie | str:
+def tie(colmap: ModuleType, model: Side, part: Side, *, has_scale: bool, seed: int = 0) -> Tie | str:
     """Return the place of a part by its matches with a model, or the reason why they do not determine it.
 
     Args:
@@ -263,7 +264,7 @@ def _sigma(model: Side, part: Side, model_from_part: Similarity, *, has_scale: b
     return float(np.sqrt(np.trace(of_centers, axis1=1, axis2=2).max())) / depth
 
 
-def _starts(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed: int) -> Iterator[Similarity]:
+def _starts(colmap: ModuleType, model: Side, part: Side, *, has_scale: bool, seed: int) -> Iterator[Similarity]:
     """Yield places of the part: by its photographs' places, by the model's in the part, by the poses of pairs."""
     yield from _by_resection(colmap, model, part, has_scale=has_scale, seed=seed)
     if has_scale:
@@ -275,7 +276,9 @@ def _starts(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed: int)
         yield from _by_pair(colmap, model.of(rows), part.of(rows), has_scale=has_scale, seed=seed)
 
 
-def _by_resection(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed: int) -> Iterator[Similarity]:
+def _by_resection(
+    colmap: ModuleType, model: Side, part: Side, *, has_scale: bool, seed: int
+) -> Iterator[Similarity]:
     """Yield places of the part by photographs of it that show points of the model."""
     shown = {image: part.image == image for image in sorted(set(part.image[model.is_point].tolist()))}
     options = colmap.AbsolutePoseEstimationOptions()
@@ -307,7 +310,7 @@ def _by_resection(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed
             yield replace(model_from_part, translation=-pose[:, :3].T @ pose[:, 3] - model_from_part.apply(center))
 
 
-def _by_pair(colmap: Any, model: Side, part: Side, *, has_scale: bool, seed: int) -> Iterator[Similarity]:
+def _by_pair(colmap: ModuleType, model: Side, part: Side, *, has_scale: bool, seed: int) -> Iterator[Similarity]:
     """Yield the place of the part by the pose of one pair of photographs, and points that both models have."""
     if len(model.image) < _FEWEST_MATCHES or not model.is_point.any() or (has_scale and not part.is_point.any()):
         return

@@ -6,11 +6,13 @@ their place relative to each other is as accurate as the fixes.
 """
 
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from pipelines.core.types import FloatArray
+from pipelines.geometry.cameras import Reconstruction
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.sfm.adjustment import alignment_with
@@ -31,7 +33,7 @@ class ModelPart:
     apart: str  # empty: it was joined
 
 
-def join_parts(colmap: Any, models: list[Any], survey: Survey) -> tuple[Any, tuple[ModelPart, ...]]:
+def join_parts(colmap: ModuleType, models: list[Any], survey: Survey) -> tuple[Any, tuple[ModelPart, ...]]:
     """Return the largest of some `pycolmap.Reconstruction`s, to which the others were added, and what these are.
 
     The models are sorted, the largest first. COLMAP lets two of them share a few photographs: the first one keeps
@@ -59,7 +61,7 @@ def join_parts(colmap: Any, models: list[Any], survey: Survey) -> tuple[Any, tup
     return whole, tuple(parts)
 
 
-def placed_by_positions(model: Any, measured: dict[str, SurveyImage]) -> Similarity | str:
+def placed_by_positions(model: Reconstruction, measured: dict[str, SurveyImage]) -> Similarity | str:
     """Return geo ← local of a model by its fixes and attitudes, or the reason why they do not place it."""
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     images = [image for image in images if image.name in measured and measured[image.name].fix is not None]
@@ -111,7 +113,7 @@ def _with_rotation(rotation: FloatArray, source: FloatArray, target: FloatArray)
     return Similarity(scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0))
 
 
-def add_part(colmap: Any, whole: Any, part: Any) -> None:
+def add_part(colmap: ModuleType, whole: Reconstruction, part: Reconstruction) -> None:
     """Add the photographs and points of a model, in the frame of another one, to that one."""
     for frame_id in sorted(set(part.reg_frame_ids()) - set(whole.reg_frame_ids())):
         source = part.frames[frame_id]

@@ -13,7 +13,7 @@ predict the camera of a photograph outside it; the photographs inside tell how f
 
 import logging
 from dataclasses import dataclass, replace
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from pipelines.core.progress import Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.formats.colmap import lens_of_colmap
-from pipelines.geometry.cameras import Camera, bearings, project
+from pipelines.geometry.cameras import Camera, ColmapDatabase, Reconstruction, bearings, project
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.statistics import NORMAL_MAD
@@ -95,7 +95,7 @@ class _Prediction:
     sigma_rad: float
 
 
-def add_predicted(colmap: Any, job: SfmJob, model: Any, progress: Progress) -> int:
+def add_predicted(colmap: ModuleType, job: SfmJob, model: Reconstruction, progress: Progress) -> int:
     """Add predicted matches of the photographs outside a model to those in the database, and verify them.
 
     Returns:
@@ -130,7 +130,7 @@ def add_predicted(colmap: Any, job: SfmJob, model: Any, progress: Progress) -> i
     return len(matches)
 
 
-def _prediction(model: Any, survey: Survey) -> _Prediction | None:
+def _prediction(model: Reconstruction, survey: Survey) -> _Prediction | None:
     """Return how fixes and attitudes predict cameras of a model; None: they do not place it, or are too few."""
     measured = {image.name: image for image in survey.images}
     geo_from_model = placed_by_positions(model, measured)
@@ -168,7 +168,7 @@ def _error_near(position: FloatArray, fixes: FloatArray, error: FloatArray) -> F
     return np.asarray(np.median(error[near], axis=0))
 
 
-def _outside(model: Any, survey: Survey, prediction: _Prediction) -> dict[int, _View]:
+def _outside(model: Reconstruction, survey: Survey, prediction: _Prediction) -> dict[int, _View]:
     """Return predicted cameras, in the model's frame, of photographs that are not in it, by COLMAP's numbers."""
     inside = set(model.reg_image_ids())
     back = prediction.geo_from_model.inverse()
@@ -191,7 +191,7 @@ def _outside(model: Any, survey: Survey, prediction: _Prediction) -> dict[int, _
     return found
 
 
-def _model_photograph(model: Any, key: int) -> _ModelPhotograph:
+def _model_photograph(model: Reconstruction, key: int) -> _ModelPhotograph:
     image = model.images[key]
     view = _View(
         lens_of_colmap(model.cameras[image.camera_id]),
@@ -226,7 +226,7 @@ def _sigma_px(view: _View, away: FloatArray, prediction: _Prediction) -> FloatAr
     return np.asarray(view.camera.mean_focal_px * sigma_rad)
 
 
-def _features(database: Any, key: int) -> _Features:
+def _features(database: ColmapDatabase, key: int) -> _Features:
     """Return the features of a photograph that have descriptors, which come first."""
     descriptor = np.asarray(database.read_descriptors(key).data, dtype=np.float64)
     keypoint = np.asarray(database.read_keypoints(key), dtype=np.float64)[: len(descriptor)]

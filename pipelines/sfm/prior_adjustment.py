@@ -25,7 +25,7 @@ from pipelines.core.stages import ADJUSTMENT, SIM3_POSTERIOR, SPARSE
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import load_reconstruction, quiet_colmap, read_sparse, write_reconstruction
-from pipelines.geometry.cameras import pycolmap_module
+from pipelines.geometry.cameras import Reconstruction, pycolmap_module
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import residual_stats
@@ -80,7 +80,7 @@ def write_adjusted(arguments: Mapping[str, Any], progress: Progress) -> dict[str
     return {"key_figure": f"{fixes.rmse_3d_m:.3f} m RMS from {fixes.count} fixes", "values": values}
 
 
-def adjust_to_fixes(model: Any, survey: Survey, alignment: Alignment, seed: int = 0) -> None:
+def adjust_to_fixes(model: Reconstruction, survey: Survey, alignment: Alignment, seed: int = 0) -> None:
     """Adjust cameras, lenses and points of a `pycolmap.Reconstruction` in place; its frame becomes `geo`.
 
     The residuals of its alignment with the fixes limit those of COLMAP's inliers.
@@ -147,13 +147,13 @@ def _identity(
     return initial, MeasurementVerdict(gnss_outliers=outliers)
 
 
-def _located(model: Any, survey: Survey) -> list[tuple[Any, Fix]]:
+def _located(model: Reconstruction, survey: Survey) -> list[tuple[Any, Fix]]:
     fixes = {image.name: image.fix for image in survey.images if image.fix is not None}
     images = (model.images[image_id] for image_id in sorted(model.reg_image_ids()))
     return [(image, fixes[image.name]) for image in images if image.name in fixes]
 
 
-def _residuals(model: Any, survey: Survey) -> FloatArray:
+def _residuals(model: Reconstruction, survey: Survey) -> FloatArray:
     """Return camera centres minus fixes (F, 3) of a model in `geo`."""
     rows = [image.projection_center() - np.array(fix.position_in_geo) for image, fix in _located(model, survey)]
     return np.array(rows).reshape(-1, 3)

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress
 from pipelines.core.types import FloatArray
 from pipelines.formats.colmap import flatten, reconstruction_of
+from pipelines.geometry.cameras import ColmapDatabase, Reconstruction
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.statistics import CAUCHY_95
 from pipelines.sfm.adjustment import alignment_with, hold_lenses_in_place
@@ -50,7 +52,9 @@ class _Lens:
     translation: FloatArray
 
 
-def with_rigs(colmap: Any, job: SfmJob, model: Any, *, lens_held: bool, progress: Progress) -> Any:
+def with_rigs(
+    colmap: ModuleType, job: SfmJob, model: Reconstruction, *, lens_held: bool, progress: Progress
+) -> Any:
     """Return a `pycolmap.Reconstruction` in which the photographs of an instant have one pose; of no rig, as it is.
 
     The survey of the job has its companions among its images.
@@ -78,7 +82,7 @@ def with_rigs(colmap: Any, job: SfmJob, model: Any, *, lens_held: bool, progress
     return constrained
 
 
-def reference_alone(model: Any, survey: Survey) -> Any:
+def reference_alone(model: Reconstruction, survey: Survey) -> Any:
     """Return a model without the photographs of companions, and without the points that only these show."""
     flat = flatten(model)
     others = {each.name for each in survey.companions}
@@ -93,7 +97,7 @@ def _numbers(survey: Survey) -> dict[str, int]:
     return {image.name: index + 1 for index, image in enumerate(survey.images)}
 
 
-def _lenses(model: Any, survey: Survey) -> dict[int, _Lens]:
+def _lenses(model: Reconstruction, survey: Survey) -> dict[int, _Lens]:
     """Return the poses of the lenses in their rigs, by COLMAP's number of the camera."""
     number = _numbers(survey)
     camera = {image.name: image.camera_id for image in survey.images}
@@ -150,7 +154,7 @@ def _mean(poses: FloatArray) -> tuple[FloatArray, FloatArray]:
     return mean, np.median(poses[kept, :, 3], axis=0)
 
 
-def _rebuilt(colmap: Any, job: SfmJob, model: Any, lenses: Mapping[int, _Lens]) -> Any:
+def _rebuilt(colmap: ModuleType, job: SfmJob, model: Reconstruction, lenses: Mapping[int, _Lens]) -> Any:
     """Return a model with rigs and frames: poses of the reference lens, else by another one of the instant."""
     new = colmap.Reconstruction()
     for camera in model.cameras.values():
@@ -172,7 +176,13 @@ def _rebuilt(colmap: Any, job: SfmJob, model: Any, lenses: Mapping[int, _Lens]) 
 
 
 def _add_instant(
-    colmap: Any, database: Any, new: Any, *, model: Any, frame_id: int, images: Mapping[int, _Lens | None]
+    colmap: ModuleType,
+    database: ColmapDatabase,
+    new: Any,
+    *,
+    model: Reconstruction,
+    frame_id: int,
+    images: Mapping[int, _Lens | None],
 ) -> None:
     """Add the photographs of an instant, if one of them is in the model; `images` has the reference's first."""
     posed = next((key for key in images if model.exists_image(key) and model.images[key].has_pose), None)
@@ -220,7 +230,7 @@ def _instants(survey: Survey, lenses: Mapping[int, _Lens]) -> dict[int, dict[int
     return instants
 
 
-def _rigs(colmap: Any, cameras: Any, lenses: Mapping[int, _Lens]) -> list[Any]:
+def _rigs(colmap: ModuleType, cameras: Any, lenses: Mapping[int, _Lens]) -> list[Any]:
     """Return the rigs of all cameras, with the numbers of their reference cameras; most consist of one camera."""
     rigs = {}
     for key, camera in cameras.items():
@@ -233,7 +243,9 @@ def _rigs(colmap: Any, cameras: Any, lenses: Mapping[int, _Lens]) -> list[Any]:
     return list(rigs.values())
 
 
-def _write_rigs(colmap: Any, database: Path, model: Any, survey: Survey, lenses: Mapping[int, _Lens]) -> None:
+def _write_rigs(
+    colmap: ModuleType, database: Path, model: Reconstruction, survey: Survey, lenses: Mapping[int, _Lens]
+) -> None:
     """Replace the rigs and frames of a database by those of a model, and of the photographs outside it alike."""
     with colmap.Database.open(database) as opened, colmap.DatabaseTransaction(opened):
         stored = {image.image_id: image for image in opened.read_all_images()}
@@ -250,7 +262,7 @@ def _write_rigs(colmap: Any, database: Path, model: Any, survey: Survey, lenses:
             opened.write_frame(frame, use_frame_id=True)
 
 
-def hold_in_body(colmap: Any, model: Any, survey: Survey, references: Mapping[int, int]) -> bool:
+def hold_in_body(colmap: ModuleType, model: Reconstruction, survey: Survey, references: Mapping[int, int]) -> bool:
     """Put lenses that were solved outside of their body to the place of the reference lens; whether any was.
 
     `references` has the reference's camera of each camera. Adjustments hold these lenses (`hold_lenses_in_place`).
@@ -292,7 +304,7 @@ def hold_in_body(colmap: Any, model: Any, survey: Survey, references: Mapping[in
     return moved
 
 
-def _median_distance(model: Any, camera_id: int) -> float:
+def _median_distance(model: Reconstruction, camera_id: int) -> float:
     """Return the median distance of the points that a camera's photographs show, along their axes."""
     depth = [
         image.cam_from_world().matrix()[2] @ [*model.points3D[point.point3D_id].xyz, 1.0]
@@ -304,7 +316,7 @@ def _median_distance(model: Any, camera_id: int) -> float:
     return float(np.median(depth))
 
 
-def _adjust(colmap: Any, job: SfmJob, model: Any, *, lens_held: bool) -> None:
+def _adjust(colmap: ModuleType, job: SfmJob, model: Reconstruction, *, lens_held: bool) -> None:
     bundle = colmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         bundle.add_image(image_id)
@@ -320,7 +332,7 @@ def _adjust(colmap: Any, job: SfmJob, model: Any, *, lens_held: bool) -> None:
     colmap.create_default_bundle_adjuster(adjustment, bundle, model).solve()
 
 
-def _triangulate(colmap: Any, job: SfmJob, database: Path, model: Any, new: list[int]) -> None:
+def _triangulate(colmap: ModuleType, job: SfmJob, database: Path, model: Reconstruction, new: list[int]) -> None:
     """Add the points of photographs that the rig alone has placed, and leave out what does not fit."""
     with colmap.Database.open(database) as opened:
         cache = colmap.DatabaseCache.create(opened, colmap.DatabaseCacheOptions())
@@ -334,7 +346,7 @@ def _triangulate(colmap: Any, job: SfmJob, database: Path, model: Any, new: list
     mapper.end_reconstruction(False)
 
 
-def _compare_stated(model: Any, survey: Survey, lenses: Mapping[int, _Lens]) -> None:
+def _compare_stated(model: Reconstruction, survey: Survey, lenses: Mapping[int, _Lens]) -> None:
     """Warn of lenses whose solved rotation is not the one that somebody stated."""
     stated = {each.camera_id: each.stated_quat_xyzw for each in survey.companions if each.stated_quat_xyzw}
     for key in sorted(set(stated) & set(lenses)):

@@ -12,6 +12,7 @@
 
 import logging
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,7 @@ class MappedModels:
         return len({image_id for model in self.models for image_id in model.reg_image_ids()})
 
 
-def map_in_rounds(colmap: Any, job: SfmJob, progress: Progress) -> MappedModels:
+def map_in_rounds(colmap: ModuleType, job: SfmJob, progress: Progress) -> MappedModels:
     """Return the models of a database with features and matches after as many rounds as they need.
 
     The first model is the largest, with those beside it that positions place; none: no two photographs match.
@@ -84,7 +85,7 @@ def map_in_rounds(colmap: Any, job: SfmJob, progress: Progress) -> MappedModels:
 
 
 def _joined_by_matches(
-    colmap: Any, job: SfmJob, mapped: MappedModels, progress: Progress
+    colmap: ModuleType, job: SfmJob, mapped: MappedModels, progress: Progress
 ) -> tuple[MappedModels, tuple[Join, ...]]:
     """Return the models, of which the largest has what its matches tie to it.
 
@@ -97,7 +98,7 @@ def _joined_by_matches(
 
 
 def _joined_by_prediction(
-    colmap: Any, job: SfmJob, mapped: MappedModels, joins: tuple[Join, ...], progress: Progress
+    colmap: ModuleType, job: SfmJob, mapped: MappedModels, joins: tuple[Join, ...], progress: Progress
 ) -> tuple[MappedModels, tuple[Join, ...]]:
     """Return the models and all joins, after matches were sought where the largest model predicts them."""
     while mapped.models and mapped.mapper != "global" and mapped.registered < len(job.survey.images):
@@ -110,7 +111,7 @@ def _joined_by_prediction(
     return mapped, joins
 
 
-def _with_lens_held(colmap: Any, job: SfmJob, free: MappedModels, progress: Progress) -> MappedModels:
+def _with_lens_held(colmap: ModuleType, job: SfmJob, free: MappedModels, progress: Progress) -> MappedModels:
     """Return the better of the models and those with the lens held, where the first has a reason to doubt it."""
     if not free.models:
         return free
@@ -151,7 +152,7 @@ def _sound_lens(mapped: MappedModels, survey: Survey) -> dict[int, Any]:
     return {}
 
 
-def _pairs_to_add(colmap: Any, job: SfmJob, mapped: MappedModels) -> IntArray:
+def _pairs_to_add(colmap: ModuleType, job: SfmJob, mapped: MappedModels) -> IntArray:
     """Return the pairs (P, 2) that learned features may connect: of photographs apart, with few matches so far."""
     apart = set(range(len(job.survey.images))) - {i - 1 for i in mapped.models[0].reg_image_ids()}
     matched = verified_matches(colmap, job.database)
@@ -162,7 +163,7 @@ def _pairs_to_add(colmap: Any, job: SfmJob, mapped: MappedModels) -> IntArray:
     return np.array(wanted, dtype=np.int64).reshape(-1, 2)
 
 
-def _add_learned(colmap: Any, job: SfmJob, pairs: IntArray, progress: Progress) -> int:
+def _add_learned(colmap: ModuleType, job: SfmJob, pairs: IntArray, progress: Progress) -> int:
     """Add learned features and matches once; the number of pairs that they match."""
     from pipelines.sfm.learned_features import add_learned  # and torch
 

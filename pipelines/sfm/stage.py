@@ -19,6 +19,7 @@ from pipelines.core.progress import Progress
 from pipelines.core.stages import COMMON_POINTS, RIG_MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import load_reconstruction, quiet_colmap
+from pipelines.geometry.cameras import Reconstruction
 from pipelines.sfm.dates import SolvedDate, tie_to_earlier
 from pipelines.sfm.features import SfmJob, masks_beside
 from pipelines.sfm.learned_weights import learned_remedy
@@ -101,7 +102,7 @@ def surveyed(path: Path, options: SfmOptions) -> Survey:
     return survey if options.import_model is not None else survey.with_companions()
 
 
-def _summarise_rig(reference: Any, model: Any, survey: Survey) -> Summary:
+def _summarise_rig(reference: Any, model: Reconstruction, survey: Survey) -> Summary:
     """Return the summary of the reference lens's photographs, with the number of all."""
     images = tuple(image for image in survey.images if image.name not in {each.name for each in survey.companions})
     summary = _summarise(reference, survey.model_copy(update={"images": images}))
@@ -112,7 +113,7 @@ def _summarise_rig(reference: Any, model: Any, survey: Survey) -> Summary:
     return Summary(figure, values, summary.warnings)
 
 
-def _summarise(model: Any, survey: Survey) -> Summary:
+def _summarise(model: Reconstruction, survey: Survey) -> Summary:
     registered, total = model.num_reg_images(), len(survey.images)
     if registered < 3:
         raise DegenerateGeometryError(

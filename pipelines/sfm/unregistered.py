@@ -5,17 +5,18 @@ only where a second one shows the same point, since two photographs alone leave 
 """
 
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 
 from pipelines.core.products import Remark
+from pipelines.geometry.cameras import Reconstruction
 
 _NEEDED = 30  # COLMAP's fewest points by which it adds a photograph
 _MOST_LISTED = 10
 
 
-def unregistered(colmap: Any, database: Path, model: Any, remedy: str = "") -> tuple[Remark, ...]:
+def unregistered(colmap: ModuleType, database: Path, model: Reconstruction, remedy: str = "") -> tuple[Remark, ...]:
     """Return the warning that says for each photograph of a database why it is not in a model; none if all are.
 
     `remedy` is that of the warning.
