@@ -60,10 +60,18 @@ class CameraEvents:
 
 
 def read_mrk(path: Path) -> CameraEvents:
-    """Read a timestamp file.
+    r"""Read a timestamp file.
 
     Raises:
         InputError: no event, a line of another layout, a coordinate out of range, or one number twice.
+
+    Example:
+        >>> _ = Path("flight.MRK").write_text(
+        ...     "1\t302418.500000\t[2312]\t-66,N\t10,E\t194,V\t46.80000000,Lat\t7.10000000,Lon\t512.000,Ellh\t"
+        ...     "0.011, 0.012, 0.025\t50,Q\n"
+        ... )
+        >>> len(read_mrk(Path("flight.MRK")).lines)
+        1
     """
     lines: list[int] = []
     values: list[list[float]] = []
@@ -262,10 +270,18 @@ _LATITUDE, _LONGITUDE, _HEIGHT = (
 
 
 def read_subtitles(path: Path) -> VideoPositions:
-    """Read the `.SRT` that DJI's drones write beside a video: `[latitude: …] [longitude: …] [… abs_alt: …]`.
+    r"""Read the `.SRT` that DJI's drones write beside a video: `[latitude: …] [longitude: …] [… abs_alt: …]`.
 
     Raises:
         InputError: no subtitle has a position, or a coordinate is out of range.
+
+    Example:
+        >>> _ = Path("video.SRT").write_text(
+        ...     "1\n00:00:00,000 --> 00:00:00,033\n"
+        ...     "[latitude: 46.8] [longitude: 7.1] [rel_alt: 50.0 abs_alt: 512.0]\n"
+        ... )
+        >>> len(read_subtitles(Path("video.SRT")).lines)
+        1
     """
     lines: list[int] = []
     values: list[list[float]] = []

@@ -93,10 +93,15 @@ _GIMBAL_FROM_ODM_DEG = np.array([0.0, -90.0, 0.0])
 
 
 def read_geo(path: Path) -> PoseTable:
-    """Read `geo.txt`. A position without z has NaN height.
+    r"""Read `geo.txt`. A position without z has NaN height.
 
     Raises:
         InputError: no CRS line, no row, a wrong number of columns, or a cell that is no number.
+
+    Example:
+        >>> _ = Path("geo.txt").write_text("EPSG:32632\na.jpg 500000 5180000 512\n")
+        >>> read_geo(Path("geo.txt")).names
+        ('a.jpg',)
     """
     table = _odm_table(path, _GEO_COLUMNS)
     numbers = []
@@ -129,11 +134,16 @@ def read_geo(path: Path) -> PoseTable:
 
 
 def read_ground_points(path: Path) -> GroundPoints:
-    """Read `gcp_list.txt`. Points without a name are named by their place in the file.
+    r"""Read `gcp_list.txt`. Points without a name are named by their place in the file.
 
     Raises:
         InputError: no CRS line, too few columns, a cell that is no number or NaN, no line at all, or one point at
             two places.
+
+    Example:
+        >>> _ = Path("gcp_list.txt").write_text("EPSG:32632\n500010 5180020 498.5 1210.5 733 a.jpg P1\n")
+        >>> read_ground_points(Path("gcp_list.txt")).marks
+        (ListedMark(line=2, name='P1', image='a.jpg', x_px=1210.5, y_px=733.0, sigma_px=None),)
     """
     table = _odm_table(path, _GCP_COLUMNS)
     points, marks = [], []
@@ -165,11 +175,16 @@ def _cells(line: str) -> list[str]:
 
 
 def read_point_list(path: Path) -> GroundPoints:
-    """Read ground points without marks: rows `name x y z`, x the easting or longitude, below the CRS if stated.
+    r"""Read ground points without marks: rows `name x y z`, x the easting or longitude, below the CRS if stated.
 
     Raises:
         InputError: no row, a number of columns other than four, a cell that is no number, or one point at two
             places.
+
+    Example:
+        >>> _ = Path("points.txt").write_text("EPSG:32632\nP1 500010 5180020 498.5\n")
+        >>> read_point_list(Path("points.txt")).points[0].xyz
+        (500010.0, 5180020.0, 498.5)
     """
     lines = [(at, text) for at, text in tables.numbered_lines(path) if not text.startswith("#")]
     tables.require_rows(lines, path)
@@ -253,10 +268,15 @@ _MARK_COLUMNS = ("image", "label", "x", "y")
 
 
 def read_point_table(path: Path, *, projected: bool = False) -> GroundPoints:
-    """Read ground points without marks; `projected`: x,y,z count where a table has latitude,longitude too.
+    r"""Read ground points without marks; `projected`: x,y,z count where a table has latitude,longitude too.
 
     Raises:
         InputError: no rows, a column is missing, a cell is no number, or one point at two places.
+
+    Example:
+        >>> _ = Path("points.csv").write_text("label,x,y,z\nP1,500010,5180020,498.5\n")
+        >>> read_point_table(Path("points.csv")).points[0].xyz
+        (500010.0, 5180020.0, 498.5)
     """
     table, header = _pix4d_table(
         path, _POINT_VOCABULARY, _POINT_COLUMNS, slice(1, 4), "label, two coordinates and z"
@@ -304,7 +324,13 @@ def _point_sigma_m(row: tables.Row) -> tuple[float | None, float | None]:
 
 
 def read_marks(path: Path) -> tuple[ListedMark, ...]:
-    """Read marks of ground points; an InputError: no rows, a column is missing, or a cell is no number."""
+    r"""Read marks of ground points; an InputError: no rows, a column is missing, or a cell is no number.
+
+    Example:
+        >>> _ = Path("marks.csv").write_text("image,label,x,y\na.jpg,P1,1210.5,733\n")
+        >>> read_marks(Path("marks.csv"))[0].x_px
+        1210.5
+    """
     table, header = _pix4d_table(path, _MARK_VOCABULARY, _MARK_COLUMNS, slice(2, 4), "image, label, x and y")
     if header is not None and not set(_MARK_COLUMNS) <= table.columns.keys():
         needed = "image, label, x and y"
@@ -330,11 +356,16 @@ class ListedDistance:
 
 
 def read_distances(path: Path) -> tuple[ListedDistance, ...]:
-    """Read distances between marked points: columns from, to, distance, and optionally σ and use, in metres.
+    r"""Read distances between marked points: columns from, to, distance, and optionally σ and use, in metres.
 
     Raises:
         InputError: no rows, a column is missing, a distance or σ is not above zero, both ends are one point, a pair
             is listed twice, or a use is neither control nor check.
+
+    Example:
+        >>> _ = Path("bars.csv").write_text("from,to,distance,sigma\nA,B,1.2504,0.0002\n")
+        >>> read_distances(Path("bars.csv"))
+        (ListedDistance(line=2, ends=('A', 'B'), distance_m=1.2504, sigma_m=0.0002, is_check=False),)
     """
     needed = "from, to and distance"
     table, header = _pix4d_table(path, _DISTANCE_VOCABULARY, _DISTANCE_COLUMNS, slice(2, 3), needed)

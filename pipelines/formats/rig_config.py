@@ -51,6 +51,13 @@ def read_rig_config(path: Path) -> tuple[RigConfig, ...]:
     Raises:
         InputError: unreadable, not of that form, a rig without exactly one reference or with one lens, two lenses
             with one prefix, or a rotation that is none.
+
+    Example:
+        >>> import json
+        >>> cameras = [{"image_prefix": "left/", "ref_sensor": True}, {"image_prefix": "right/"}]
+        >>> _ = Path("rig.json").write_text(json.dumps([{"cameras": cameras}]))
+        >>> len(read_rig_config(Path("rig.json")))
+        1
     """
     rigs = load_json(_Rigs, path).root
     if not rigs:

@@ -104,13 +104,18 @@ _FEWEST_WORDS = 4  # between spaces, of a header without other separators
 
 
 def read_trajectory(path: Path, *, projected: bool = False) -> PoseTable:
-    """Read a trajectory; `projected`: of x,y,z and latitude,longitude,altitude in one table, the former count.
+    r"""Read a trajectory; `projected`: of x,y,z and latitude,longitude,altitude in one table, the former count.
 
     Separators are tab, `;`, `,` or spaces; with the first two, decimals may be written with commas.
 
     Raises:
         InputError: no usable header, no row, a cell that is no number, a value out of range, half a group of
             columns, or a row longer than the header. Names file, line and column.
+
+    Example:
+        >>> _ = Path("track.csv").write_text("image,latitude,longitude,altitude\na.jpg,46.8,7.1,512\n")
+        >>> read_trajectory(Path("track.csv")).xyz.tolist()
+        [[7.1, 46.8, 512.0]]
     """
     table, header = _read_table(path)
     line = table.header_line or 1
