@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
-from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration, write_comparison
-from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy, compared_surface
+from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, Configuration
+from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy, compared_surface, write_comparison
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, GeorefError, InputError
 from pipelines.core.options import read_requests, remember
 from pipelines.core.products import union

@@ -1,11 +1,15 @@
-"""Table of `georef compare`: the figures of each configuration, as Markdown and as bars."""
+"""Table of `georef compare`: the figures of each configuration, as JSON, Markdown, bars and a page."""
 
 from collections.abc import Iterable, Sequence
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
+from pipelines import __version__
 from pipelines.core.figures import ERRORS, MISSING, WAYS
+from pipelines.core.files import replace_text
 from pipelines.core.products import Product, Remark
-from pipelines.report.plots.charts import BarChart
+from pipelines.report.page import Page, Section, png_file, render_page
+from pipelines.report.plots.charts import BarChart, write_bars
 from pipelines.survey.report_parts import ReferenceComparison
 
 # Errors of the check points that the table shows: the way of measuring (key of `WAYS`), field of `PointAccuracy`.
@@ -177,3 +181,52 @@ def _text(value: float | None, decimals: int | None = None) -> str:
     if value is None:
         return MISSING
     return f"{value:.{decimals or (4 if value < 1 else 2)}f}"
+
+
+JSON, MARKDOWN, PLOT, PAGE = "table.json", "table.md", "plot.png", "comparison.html"
+_PACKAGE = __name__.rpartition(".")[0]  # its folder `templates` has the sections of the page
+
+
+def write_comparison(folder: Path, table: Comparison, survey: str) -> None:
+    """Write `table.json`, `table.md`, `plot.png` and `comparison.html`, unless the files already hold this table.
+
+    `survey` is the name of the workspace, for the page.
+    """
+    json_path, markdown_path, page_path = folder / JSON, folder / MARKDOWN, folder / PAGE
+    json_text, markdown_text = table.model_dump_json(indent=1) + "\n", markdown(table)
+    is_held = _holds(json_path, json_text) and _holds(markdown_path, markdown_text)
+    if is_held and (folder / PLOT).exists() and page_path.exists():
+        return
+    write_bars(folder / PLOT, bar_charts(table.rows))
+    replace_text(page_path, render_page(comparison_page(table, folder / PLOT, survey), _PACKAGE))
+    replace_text(markdown_path, markdown_text)
+    replace_text(json_path, json_text)
+
+
+def comparison_page(table: Comparison, plot: Path, survey: str) -> Page:
+    """Return the page of a comparison, with the PNG of its bars and the name of the workspace."""
+    names = ", ".join(row.configuration for row in table.rows)
+    facts: dict[str, Any] = {
+        "points": {
+            f"{way}.{name}": f"{WAYS[way]}: {ERRORS[name].label} in {ERRORS[name].unit}"
+            for way, name in POINT_FIGURES
+        },
+        "rows": table.rows,
+        "bars": png_file(plot),
+        "remarks": [(row, remarks_on(row)) for row in table.rows if remarks_on(row)],
+        "options": table.options,
+    }
+    return Page(
+        title=f"Comparison: {survey}",
+        subtitle="One survey, trained and measured in several configurations",
+        about={"Program": f"GeoRefGS {__version__}", "Configurations": names},
+        sections=(
+            Section("figures", "Figures", "figures.html", facts),
+            Section("configurations", "Configurations", "configurations.html", facts),
+        ),
+        document=table.model_dump(mode="json"),
+    )
+
+
+def _holds(path: Path, text: str) -> bool:
+    return path.exists() and path.read_text(encoding="utf-8") == text

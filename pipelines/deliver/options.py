@@ -1,4 +1,4 @@
-"""Options of the deliverables, and a description of each file of a workspace for those who receive it."""
+"""Options of the deliverables."""
 
 from typing import Annotated, Literal
 from urllib.parse import urlsplit

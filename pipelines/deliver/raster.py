@@ -1,8 +1,8 @@
 """Stage `export-raster`: orthophoto, surface model (DSM) and σ rasters in a CRS, contours, hillshade and preview.
 
-Reads the survey, the trained model and the initial similarity. Writes `raster/orthophoto.tif`, `dsm.tif`,
-`sigma_h.tif`, `sigma_v.tif` as Cloud Optimized GeoTIFF, each with its sidecar, `hillshade.png` and `preview.png`;
-with `--contours` also `contours.gpkg` and `contours.dxf`, with `--bands` also `bands.tif`. The Gaussians are
+Reads the survey, the trained model and the initial similarity. Writes `raster/orthophoto.tif`, `dsm.tif`, their σ,
+`measured.tif` and, of the ground, `dtm.tif` as Cloud Optimized GeoTIFF, each with its sidecar, and pictures; with
+`--contours` also `contours.gpkg` and `contours.dxf`, with `--bands` also `bands.tif`. The Gaussians are
 rendered orthographically, and the photographs projected onto that surface, window by window: finished windows
 survive an interruption.
 """

@@ -1,20 +1,27 @@
-"""Photographs of a survey: adjusted positions with error ellipses, residuals of fixes in time; and its lenses."""
+"""Photographs of a survey: adjusted positions with error ellipses, residuals of fixes, overlap; and its lenses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_matrix, triu
+from scipy.sparse.csgraph import connected_components
 
 from pipelines.adjust.posterior import Posterior
 from pipelines.core.products import is_checked
-from pipelines.core.types import BoolArray, FloatArray, vector3
+from pipelines.core.types import BoolArray, FloatArray, IntArray, vector3
 from pipelines.geometry.cameras import LENGTHS, Camera, parameter_names, parameters_in
 from pipelines.geometry.network import Network
 from pipelines.report.page import Picture, picture_of_png
 from pipelines.report.place import Texts, heads_of, map_coordinates, texts_of
 from pipelines.report.plots.charts import correlation_matrix, fix_series, residual_field
-from pipelines.report.plots.plans import movement_plan
+from pipelines.report.plots.plans import (
+    match_plan,
+    movement_plan,
+    overlap_plan,
+)
 from pipelines.report.views import reprojection_residuals
+from pipelines.survey.area import overlap_of
 from pipelines.survey.headline import NOTHING_CHECKS
 from pipelines.survey.solution import FixDifferences, Solution, fix_differences
 from pipelines.survey.survey import FixSession, Survey
@@ -349,3 +356,77 @@ def _lens(
 def _rmse(residual_px: FloatArray) -> float | None:
     good = residual_px[np.isfinite(residual_px).all(axis=1)]
     return float(np.sqrt((good**2).sum(axis=1).mean())) if len(good) else None
+
+
+ENOUGH_PHOTOGRAPHS = 5
+TIED_POINTS = 15  # that two photographs share, as SfM demands of a pair
+_MOST_LINKS = 4000  # that are drawn
+
+
+@dataclass(frozen=True)
+class OverlapFacts:
+    """Overlap of a survey; the map and its figures are None without a scene."""
+
+    overlap: Picture | None
+    cell_m: float | None
+    median: float | None  # photographs that see half of the cells or more
+    enough_share: float | None  # of the cells, that at least `enough` photographs see
+    enough: int
+    matches: Picture  # photographs that share points, with the strongest `drawn_links` of `links`
+    links: int
+    drawn_links: int
+    tied_points: int  # that a pair must share to count as tied
+    median_tied: float  # photographs that one is tied to; `least_tied` has fewest
+    least_tied: str
+    least_tied_count: int
+    parts: int  # groups of photographs without a common point; 1: all are connected
+
+
+def overlap_facts(posterior: Posterior, network: Network, scene: FloatArray, crs: TargetCrs) -> OverlapFacts:
+    """Return what the section on overlap shows: photographs by cell, pairs of photographs by shared points.
+
+    The network has the image observations; the scene (N, 3) is in `geo`.
+    """
+    solution, sparse = posterior.solution, posterior.sparse
+    center, raster = solution.center_in_geo[:, :2], overlap_of(solution, sparse, scene)
+    inside = np.zeros(0) if raster is None else raster.count[raster.count >= 0]
+    pairs, shared = links_of(network)
+    strongest = np.argsort(-shared, kind="stable")[:_MOST_LINKS]
+    tied, parts = ties_of(len(center), pairs, shared)
+    least, coordinates = int(tied.argmin()), map_coordinates(crs)
+    return OverlapFacts(
+        overlap=None
+        if raster is None
+        else picture_of_png(overlap_plan(raster.count, raster.corner, raster.cell_m, center, coordinates)),
+        cell_m=None if raster is None else raster.cell_m,
+        median=float(np.median(inside)) if len(inside) else None,
+        enough_share=float((inside >= ENOUGH_PHOTOGRAPHS).mean()) if len(inside) else None,
+        enough=ENOUGH_PHOTOGRAPHS,
+        matches=picture_of_png(match_plan(center, pairs[strongest], shared[strongest], coordinates)),
+        links=len(pairs),
+        drawn_links=len(strongest),
+        tied_points=TIED_POINTS,
+        median_tied=float(np.median(tied)),
+        least_tied=sparse.image_name[least],
+        least_tied_count=int(tied[least]),
+        parts=parts,
+    )
+
+
+def links_of(network: Network) -> tuple[IntArray, IntArray]:
+    """Return the pairs (P, 2) of photographs that share points, and the number (P,) of points that they share."""
+    images, points = len(network.camera_id), len(network.point_in_world)
+    seen = csr_matrix(
+        (np.ones(len(network.obs_image), dtype=np.int64), (network.obs_image, network.obs_point)), (images, points)
+    )
+    seen.data[:] = 1  # a point that is observed twice in one photograph counts once
+    shared = triu(seen @ seen.T, k=1).tocoo()
+    return np.column_stack([shared.row, shared.col]).astype(np.int64), shared.data.astype(np.int64)
+
+
+def ties_of(images: int, pairs: IntArray, shared: IntArray) -> tuple[IntArray, int]:
+    """Return the number (n,) of photographs that each is tied to, and the number of groups without a tie."""
+    strong = pairs[shared >= TIED_POINTS]
+    tied = np.bincount(strong.ravel(), minlength=images).astype(np.int64)
+    graph = csr_matrix((np.ones(len(strong)), (strong[:, 0], strong[:, 1])), (images, images))
+    return tied, int(connected_components(graph, directed=False)[0])

@@ -16,7 +16,7 @@ from pipelines.core.stages import BY_NAME, HILLSHADE, ORTHOPHOTO_PREVIEW
 from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.footprints import PointSurface
-from pipelines.report.cameras import LensesFacts
+from pipelines.report.cameras import LensesFacts, OverlapFacts
 from pipelines.report.options import ReportOptions
 from pipelines.report.page import (
     Picture,
@@ -29,7 +29,6 @@ from pipelines.report.page import (
     read_pixels,
     share,
 )
-from pipelines.report.place import OverlapFacts
 from pipelines.report.plots.maps import RasterPlace, raster_map
 from pipelines.report.record import measured_share
 from pipelines.survey.area import ground_sampling_m

@@ -18,12 +18,19 @@ from pipelines.core.products import Remark, union
 from pipelines.core.stages import REPORT_PAGE
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.report.accuracy import accuracy_facts
-from pipelines.report.cameras import CamerasFacts, LensesFacts, cameras_facts, lenses_facts
+from pipelines.report.cameras import (
+    CamerasFacts,
+    LensesFacts,
+    OverlapFacts,
+    cameras_facts,
+    lenses_facts,
+    overlap_facts,
+)
 from pipelines.report.chromium import chromium_path, print_pdf
 from pipelines.report.cover import cover_facts
 from pipelines.report.options import ReportOptions
 from pipelines.report.page import Page, Section, moment, render_page
-from pipelines.report.place import OverlapFacts, overlap_facts, place_facts
+from pipelines.report.place import place_facts
 from pipelines.report.points import points_facts
 from pipelines.report.record import (
     RecordFacts,

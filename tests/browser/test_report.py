@@ -15,8 +15,7 @@ from playwright.sync_api import Browser, Page, Route
 
 from pipelines.change.options import ChangeOptions
 from pipelines.change.stage import run as run_change
-from pipelines.compare.configurations import PAGE, write_comparison
-from pipelines.compare.table import ComparedRow, Comparison, PointAccuracy
+from pipelines.compare.table import PAGE, ComparedRow, Comparison, PointAccuracy, write_comparison
 from pipelines.core.stages import CHANGE_PAGE
 from pipelines.core.workspace import StageRun
 from pipelines.report.chromium import print_pdf

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.compare.configurations import PAGE, write_comparison
 from pipelines.compare.table import (
+    PAGE,
     ComparedRow,
     Comparison,
     PointAccuracy,
     cells,
     markdown,
     remarks_on,
+    write_comparison,
 )
 from pipelines.core.products import Remark
 from tests.reports import check_points_with

@@ -16,10 +16,17 @@ from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import SILENT
 from pipelines.core.stages import SURVEY
 from pipelines.report.accuracy import ninety_percent
-from pipelines.report.cameras import bias_of, cameras_facts, lenses_facts, mean_by_region
+from pipelines.report.cameras import (
+    bias_of,
+    cameras_facts,
+    lenses_facts,
+    links_of,
+    mean_by_region,
+    overlap_facts,
+    ties_of,
+)
 from pipelines.report.cover import cover_facts, days_of, flying_height_m
 from pipelines.report.options import ReportOptions
-from pipelines.report.place import links_of, overlap_facts, ties_of
 from pipelines.report.points import cut_chips, points_facts
 from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, verdict_of, verdicts
 from pipelines.report.views import read_metrics
