@@ -286,15 +286,17 @@ def test_public_functions_say_what_they_return() -> None:
 @pytest.mark.parametrize(
     ("formula", "home"),
     [
-        (r"inv\(\s*np\.linalg\.cholesky", "geometry/statistics.py"),  # the root of an information
+        (r"np\.linalg\.cholesky\((?!normal)", "geometry/statistics.py"),  # the root of a covariance
         (r"np\.eye\(3\) - direction", "geometry/intersection.py"),  # projections across rays
-        (r"\b_?(SIGMA|PRIOR)_BORESIGHT_RAD\b.* = ", "adjust/state.py"),
+        (r"\b_?(SIGMA|PRIOR)_(ARM_M|BORESIGHT_RAD)\b.* = ", "adjust/state.py"),
+        (r"\bprior\b.*=.*_OBSERVED_PART|_OBSERVED_PART.* = ", "adjust/state.py"),  # the rule of what is observed
+        (r"^    estimate: MountParameters", "ingest/options.py"),  # the option that names it
     ],
-    ids=["roots", "rays", "prior"],
+    ids=["roots", "rays", "prior", "rule", "option"],
 )
 def test_formula_is_written_once(formula: str, home: str) -> None:
     files = (REPOSITORY / "pipelines").rglob("*.py")
-    assert [str(path) for path in files if re.search(formula, path.read_text("utf-8"))] == [
+    assert [str(path) for path in files if re.search(formula, path.read_text("utf-8"), re.MULTILINE)] == [
         str(REPOSITORY / "pipelines" / home)
     ]
 

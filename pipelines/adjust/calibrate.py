@@ -1,8 +1,11 @@
-"""Stage `calibrate`: time offset, boresight and lever arm, from the SfM cameras against the recorded navigation.
+"""Stage `calibrate`: time offset, and starts of boresight and lever arm, by SfM cameras and recorded navigation.
 
 Reads `ingest/survey.json`, `sfm/sparse`, and `ingest/track.npz` if the navigation was recorded by time; positions
 by photograph are tested for a lag instead. Writes `calibrate/rig.json`. Its applied estimates change positions and
 attitudes when later stages read the survey (`survey.calibrated.load_survey`). The SfM model stays as it is.
+
+Boresight and lever arm are unknowns of the adjustment. It needs a start: an arm of a metre would make outliers of
+most positions of an RTK receiver. Here they are free so that their errors do not become a time offset.
 """
 
 from typing import Literal
@@ -28,7 +31,7 @@ from pipelines.survey.calibrated import (
     NavigationTrack,
     apply_calibration,
     load_track,
-    require_estimable,
+    shown_by,
 )
 from pipelines.survey.survey import (
     FixLag,
@@ -49,13 +52,13 @@ def run(stage: StageRun, options: CalibrateOptions) -> Summary:
     workspace, calibration = stage.workspace, RigCalibration()
     survey = load_json(Survey, workspace.path(SURVEY))
     model = read_sparse(workspace.path(SPARSE))
-    track = _track(workspace, needed=bool(_wanted(survey, options)))
-    if track is not None and _wanted(survey, options):
+    track = _track(workspace, needed="time-offset" in survey.estimate)
+    if track is not None and _wanted(survey, track):
         calibration = calibrate(survey, model, track, options)
-    if options.apply is not False:
+    if options.apply:
         calibration = with_lag(survey, model, track, calibration)
     save_json(calibration, stage.out / "rig.json")
-    return _summary(calibration, survey)
+    return _summary(calibration)
 
 
 def _track(workspace: Workspace, *, needed: bool) -> NavigationTrack | None:
@@ -73,16 +76,11 @@ def calibrate(
 ) -> RigCalibration:
     """Return the estimates of the rig.
 
-    An observable estimate is applied if the survey names its parameter. `options.apply` overrides the survey: all
-    observable estimates, or none. A flight in which no parameter is observable is no failure: `problem` states the
+    They are those of the survey that the navigation can show. The observable ones are applied, unless
+    `options.apply` forbids it. A flight in which no parameter is observable is no failure: `problem` states the
     reason.
-
-    Raises:
-        InputError: the navigation was not recorded by time; or attitudes, the body's axes or the mount are needed
-            and unknown.
     """
-    wanted = _wanted(survey, options)
-    require_estimable(track, wanted, "--estimate")
+    wanted = _wanted(survey, track)
     data, start_s = _data(survey, model, track), float(track.time_offset_s)
     free = rig_fit.FitOptions("time-offset" in wanted, "lever-arm" in wanted, options.max_offset)
     try:
@@ -91,8 +89,7 @@ def calibrate(
         return RigCalibration(wanted=wanted, problem=error.fault, remedy=error.remedy)
     found = _estimates(fit, track)
     estimates = [found[name] for name in wanted]
-    to_apply = survey.estimate if options.apply is None else wanted if options.apply else ()
-    applied = tuple(estimate for estimate in estimates if all(estimate.observable) and estimate.name in to_apply)
+    applied = tuple(estimate for estimate in estimates if options.apply and all(estimate.observable))
     attitude = fit.rms_attitude_deg
     return RigCalibration(
         wanted=wanted,
@@ -156,8 +153,8 @@ def lag_of(survey: Survey, pattern: FixPattern) -> FixLag:
     )
 
 
-def _wanted(survey: Survey, options: CalibrateOptions) -> tuple[RigParameter, ...]:
-    return survey.estimate if options.estimate is None else options.estimate
+def _wanted(survey: Survey, track: NavigationTrack) -> tuple[RigParameter, ...]:
+    return tuple(name for name in shown_by(track) if name in survey.estimate)
 
 
 def _data(survey: Survey, model: SparseModel, track: NavigationTrack) -> rig_fit.RigData:
@@ -210,7 +207,7 @@ def _estimates(fit: rig_fit.RigFit, track: NavigationTrack) -> dict[RigParameter
     }
 
 
-def _summary(calibration: RigCalibration, survey: Survey) -> Summary:
+def _summary(calibration: RigCalibration) -> Summary:
     lag = calibration.fix_lag
     values = {
         "fix_lag": None if lag is None else lag.model_dump(mode="json", exclude={"velocity_in_geo"}),
@@ -221,7 +218,7 @@ def _summary(calibration: RigCalibration, survey: Survey) -> Summary:
             include={"images", "control_points", "rms_position_m", "rms_attitude_deg"}
         ),
     }
-    return Summary(_key_figure(calibration), values, _warnings(calibration, survey))
+    return Summary(_key_figure(calibration), values, _warnings(calibration))
 
 
 def _key_figure(calibration: RigCalibration) -> str:
@@ -242,8 +239,11 @@ def _key_figure(calibration: RigCalibration) -> str:
     return "; ".join(parts) or "nothing of the rig is observable"
 
 
-def _warnings(calibration: RigCalibration, survey: Survey) -> tuple[Remark, ...]:
-    """Return warnings of parameters that keep the values of `ingest` although they were to be estimated."""
+def _warnings(calibration: RigCalibration) -> tuple[Remark, ...]:
+    """Return warnings of a lag, and of a time offset that stays as `ingest` set it although it was asked for.
+
+    What the flight does not show of boresight and lever arm is said of their solution, by `init-sim3`.
+    """
     warnings = []
     if calibration.fix_lag is not None and (calibration.fix_lag.applied or calibration.fix_lag.sigma_along_s):
         code = FIX_LAG if calibration.fix_lag.applied else FIX_LAG_OPEN
@@ -254,14 +254,10 @@ def _warnings(calibration: RigCalibration, survey: Survey) -> tuple[Remark, ...]
     warnings += [
         Remark(
             code="rig-not-observable",
-            sentence=f"The {estimate.name} is not observable in this flight (σ {max(estimate.sigma):.2g} "
-            f"{estimate.unit}): the value that ingest set stays.",
+            sentence=f"The time offset is not observable in this flight (σ {max(estimate.sigma):.2g} s): the value "
+            "that ingest set stays.",
         )
         for estimate in calibration.estimates
-        if not all(estimate.observable) and not (estimate.name == "time-offset" and warnings)
+        if estimate.name == "time-offset" and not all(estimate.observable) and not warnings
     ]
-    missed = [name for name in survey.estimate if name not in calibration.wanted]
-    if missed:
-        sentence = f"Parameters that the survey was to estimate are left out: {', '.join(missed)}."
-        warnings.append(Remark(code="rig-not-estimated", sentence=sentence, remedy="--estimate can name them."))
     return tuple(warnings)

@@ -24,6 +24,7 @@ from scipy.interpolate import CubicSpline
 from pipelines.adjust.alignment import covariance_of
 from pipelines.adjust.hypotheses import fit, hangs_upside_down
 from pipelines.adjust.measurements import fix_correspondences
+from pipelines.adjust.state import SIGMA_ARM_M
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation
@@ -34,7 +35,7 @@ from pipelines.survey.survey import Survey
 _LEAST_IMAGES = 8
 _LEG_STEPS, _LEG_PAUSE_S = 2.5, 3.0  # usual intervals, and seconds, beyond which a leg ends
 _LEAST_SEARCH_S, _MOST_LAG_S, _SCAN_STEP_S = 1.2, 3.0, 0.1
-_PRIOR_LAG_S, _PRIOR_ARM_M = 5.0, 5.0  # wide: they keep what is open finite
+_PRIOR_LAG_S = 5.0  # wide: it keeps what is open finite
 _USUAL_LAG_S, _USUAL_ARM_M = 1.0, 0.5
 _STEPS, _WIDE, _NARROWING = 25, 16.0, 0.6
 _LEAST_SIGMA_M = 1e-3
@@ -245,7 +246,7 @@ def _fitted(data: _Data, start: tuple[Similarity, float, Similarity], with_lag: 
     free = np.ones(10, dtype=bool)
     free[_LAG], free[_ARM] = with_lag, with_arm
     prior = np.full(10, np.inf)
-    prior[_LAG], prior[_ARM] = _PRIOR_LAG_S, _PRIOR_ARM_M
+    prior[_LAG], prior[_ARM] = _PRIOR_LAG_S, SIGMA_ARM_M
     pivot = similarity.apply(data.center).mean(axis=0)
     for number in range(_STEPS):
         residual, jacobian, velocity = _linearised(data, similarity, lag_s, arm, pivot)

@@ -49,9 +49,9 @@ from pipelines.adjust.measurements import (
     rejected_of,
     start_of,
 )
-from pipelines.adjust.options import EstimatedErrorName, InitSim3Options
+from pipelines.adjust.options import InitSim3Options
 from pipelines.adjust.posterior import Posterior, save_posterior
-from pipelines.adjust.solution import adjusted
+from pipelines.adjust.solution import adjusted, remarks_of
 from pipelines.adjust.system import Linearised, minimise
 from pipelines.adjust.terms import ControlPoints, Distances, Fixes
 from pipelines.adjust.tied import cautions_of_common, outliers_in_common, start_at_common
@@ -69,9 +69,13 @@ from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
 from pipelines.survey.scene import Scene, initial_scene
 from pipelines.survey.solution import GeolocatedPoints, MeasurementVerdict, SimilarityEstimate, Solution
-from pipelines.survey.survey import Survey
+from pipelines.survey.survey import MountParameter, Survey
 
 _DISAGREE = 3.5  # σ by which a distance misses the solution; one in two thousand does by chance
+_OF_MOUNT = {
+    "boresight": "`georef ingest --boresight` can apply it.",
+    "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body.",
+}
 _LEVEL = 0.01  # of the χ² test of σ where no joint adjustment is possible
 
 
@@ -86,7 +90,7 @@ def run(stage: StageRun, options: InitSim3Options) -> Summary:
     save_json(_initial_of(solution), stage.out / Path(SIM3).name)
     save_posterior(posterior, stage.out / Path(SIM3_POSTERIOR).name)
     figure, values = _figures(solution, is_local=survey.origin is None)
-    return Summary(figure, values, warnings, solution.cautions)
+    return Summary(figure, values, (*warnings, *_of_mount(solution)), solution.cautions)
 
 
 def estimate_similarity(
@@ -111,7 +115,7 @@ def estimate_similarity(
     if options.method == "paper":
         control, unused = control_correspondences(survey, model)
         initial = similarity_by_paper(model, points, fix_correspondences(survey, model).joined(control))
-        posterior = solved(survey, model, initial, estimate=options.estimate)
+        posterior = solved(survey, model, initial, estimate=survey.unknown_mount)
         warnings = _of_unused(unused)
     elif survey.origin is None:
         posterior, warnings = similarity_by_distances(survey, model, points, options)
@@ -168,6 +172,7 @@ def _figures(solution: Solution, *, is_local: bool) -> tuple[str, dict[str, Any]
         "condition_number": initial.condition_number,
         "inliers": initial.inliers,
         "earlier": None if earlier is None else earlier.model_dump(),
+        "estimated_errors": [error.model_dump() for error in solution.estimated_errors],
         "gnss_outliers": list(solution.gnss_outliers),
         "variance_factors": [factor.model_dump() for factor in solution.variance_factors],
         "residuals": {kind: stats.model_dump() for kind, stats in initial.residuals.items()},
@@ -202,16 +207,16 @@ def robust_similarity(
     meets = survey.model_copy(update={"control_points": meeting})
     pattern = pattern_of(meets, model)
     of_arm: tuple[Remark, ...] = ()
-    if pattern is not None and pattern.has_arm and "lever-arm" not in options.estimate:
-        options = options.model_copy(update={"estimate": (*options.estimate, "lever-arm")})
-        of_arm = (arm_caution(pattern),)
+    mount = survey.unknown_mount
+    if pattern is not None and pattern.has_arm and "lever-arm" not in mount:
+        mount, of_arm = (*mount, "lever-arm"), (arm_caution(pattern),)
     try:
         starts = (
             *start_at_common(meets, model, aligned),
             *_levelled_start(survey, model, data, aligned),
             *_starts(data, aligned, options.seed),
         )
-        scene, near, consistency = adjust_jointly(meets, model, starts, estimate=options.estimate)
+        scene, near, consistency = adjust_jointly(meets, model, starts, estimate=mount)
     except DegenerateGeometryError as error:
         inconsistencies = unadjustable(meets, model, alignment.geo_from_local, pattern)
         _refuse(inconsistencies, options)
@@ -221,7 +226,7 @@ def robust_similarity(
         cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, (unchecked,))
         initial = _without_joint(aligned, alignment.solution)
         verdict = verdict.model_copy(update={"cautions": cautions})
-        return solved(survey, model, initial, verdict, estimate=options.estimate), warnings
+        return solved(survey, model, initial, verdict, estimate=mount), warnings
     motion, of_lens = near.problem.bundle.row_motion, focal_length_of(survey, model)
     inconsistencies, limits = cautions_of(meets, scene, near, consistency, pattern, bent=bool(of_lens))
     scale = scene.geo_from_local(near.state.geo_from_model).scale
@@ -232,7 +237,7 @@ def robust_similarity(
     cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, of_lens, limits, of_earlier)
     told = {caution.code for caution in cautions}
     verdict = verdict.model_copy(update={"cautions": cautions})
-    posterior = solved(survey, model, initial, verdict, estimate=options.estimate, joint=(scene, near))
+    posterior = solved(survey, model, initial, verdict, estimate=mount, joint=(scene, near))
     return posterior, warnings + tuple(one for one in more if one.code not in told)
 
 
@@ -245,10 +250,10 @@ def similarity_by_distances(
         DegenerateGeometryError: no distance sets the scale, or the photographs have no upward direction in common.
     """
     start, level = local_similarity(survey, model, options.up)
-    scene, near, consistency = adjust_jointly(survey, model, (Start(start),), estimate=options.estimate)
+    scene, near, consistency = adjust_jointly(survey, model, (Start(start),), estimate=survey.unknown_mount)
     before = start, MeasurementVerdict(cautions=union(survey.cautions, (level,)))
     initial, verdict, warnings = _joint_product(points, before, scene, near, consistency)
-    return solved(survey, model, initial, verdict, estimate=options.estimate, joint=(scene, near)), warnings
+    return solved(survey, model, initial, verdict, estimate=survey.unknown_mount, joint=(scene, near)), warnings
 
 
 def solved(
@@ -257,7 +262,7 @@ def solved(
     initial: SimilarityEstimate,
     verdict: MeasurementVerdict | None = None,
     *,
-    estimate: tuple[EstimatedErrorName, ...] = (),
+    estimate: tuple[MountParameter, ...] = (),
     joint: tuple[Scene, Linearised] | None = None,
 ) -> Posterior:
     """Return the solution of a joint adjustment without the measurements that it has rejected.
@@ -285,6 +290,14 @@ def solved(
     if joint is not None:
         initial = initial.model_copy(update={"geo_from_local": solution.similarity_from_local()})
     return replace(posterior, solution=solution.model_copy(update={"initial": initial}))
+
+
+def _of_mount(solution: Solution) -> Iterator[Remark]:
+    """Yield what is to be said of boresight and lever arm, unless a caution has said it."""
+    said = {caution.code for caution in solution.cautions}
+    for error in solution.estimated_errors:
+        if error.name in _OF_MOUNT and error.name not in said:
+            yield from remarks_of(error, _OF_MOUNT[error.name])
 
 
 def _refuse(inconsistencies: tuple[Remark, ...], options: InitSim3Options) -> None:

@@ -20,7 +20,6 @@ import numpy as np
 
 from pipelines.adjust.alignment import mean_rotation
 from pipelines.adjust.measurements import onto_control, problem_of, recorded_rotations, start_of
-from pipelines.adjust.options import EstimatedErrorName
 from pipelines.adjust.state import State
 from pipelines.adjust.system import Linearised, NormalMatrix, Problem, linearised, minimise, posterior_weights
 from pipelines.adjust.terms import CommonErrors, ControlPoints, Distances, EarlierPoints, Fixes
@@ -41,7 +40,7 @@ from pipelines.survey.report_parts import (
 )
 from pipelines.survey.scene import Scene, initial_scene
 from pipelines.survey.solution import SimilarityEstimate
-from pipelines.survey.survey import Survey
+from pipelines.survey.survey import MountParameter, Survey
 
 _ROUNDS, _SETTLED = 8, 0.02  # of the factors, and their relative change at which they are final
 _NEAR = 0.5  # relative change up to which the equations before it serve the first steps
@@ -96,7 +95,7 @@ class Start:
 
 
 def adjust_jointly(
-    survey: Survey, model: SparseModel, starts: Iterable[Start], *, estimate: tuple[EstimatedErrorName, ...] = ()
+    survey: Survey, model: SparseModel, starts: Iterable[Start], *, estimate: tuple[MountParameter, ...] = ()
 ) -> tuple[Scene, Linearised, Consistency]:
     """Return the minimum from the first start, or the likeliest of several where the first finds disagreement.
 
@@ -148,7 +147,7 @@ class _Found(NamedTuple):
     cost: float  # −2 ln likelihood at the stated σ; compares solutions from different starts
 
 
-def _adjust(survey: Survey, scene: Scene, start: Start, estimate: tuple[EstimatedErrorName, ...]) -> _Found:
+def _adjust(survey: Survey, scene: Scene, start: Start, estimate: tuple[MountParameter, ...]) -> _Found:
     """Alternate between the solution and the variance factors, from the stated σ."""
     fixed = {
         factor.group: factor for factor in (*_marks(survey, scene), *_attitudes(survey, scene.sparse), _ties(scene))

@@ -9,7 +9,6 @@ import numpy as np
 from pipelines.adjust.alignment import Correspondences, RotationPrior, mean_rotation
 from pipelines.adjust.drift import drift_shapes
 from pipelines.adjust.level import level_of
-from pipelines.adjust.options import EstimatedErrorName
 from pipelines.adjust.state import (
     SIGMA_ARM_M,
     SIGMA_BORESIGHT_RAD,
@@ -43,7 +42,7 @@ from pipelines.survey.common_points import CommonPoints
 from pipelines.survey.marks import MarkRays, RayErrors, intersect_marks, mark_angles, mark_rays
 from pipelines.survey.scene import Scene
 from pipelines.survey.solution import EarlierDate, MeasurementVerdict
-from pipelines.survey.survey import Survey
+from pipelines.survey.survey import MountParameter, Survey
 
 _INCONSISTENT_SIGMAS = 6.0
 _INCONSISTENT_RAD = np.radians(15.0)  # lower limit, because the σ of attitudes are often optimistic
@@ -219,7 +218,7 @@ def problem_of(
     scene: Scene,
     survey: Survey,
     *,
-    estimate: Iterable[EstimatedErrorName] = (),
+    estimate: Iterable[MountParameter] = (),
     with_attitudes: bool = False,
     planes: Planes | None = None,
 ) -> Problem:

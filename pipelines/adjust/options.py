@@ -1,53 +1,34 @@
 """Options of `georef calibrate`, `georef geolocate` and `georef init-sim3`."""
 
-from typing import Annotated, Literal, get_args
+from typing import Literal
 
 from pydantic import Field
 
-from pipelines.core.options import WRITTEN, StageOptions, from_text, listed_names
-from pipelines.survey.survey import RigParameters
-
-# Systematic errors to be estimated beside the common error of the fixes.
-EstimatedErrorName = Literal["lever-arm", "boresight"]
-
-
-EstimatedErrorNames = Annotated[
-    tuple[EstimatedErrorName, ...],
-    from_text(lambda text: () if text == "none" else listed_names(text, get_args(EstimatedErrorName), "; or none")),
-    WRITTEN,
-]
+from pipelines.core.options import StageOptions
 
 
 class CalibrateOptions(StageOptions):
-    """Options of the calibration of the rig: parameters to estimate, and parameters to apply.
+    """Options of the calibration of the rig: search of the time offset, and whether what is found is applied.
 
     After sfm, the track of the cameras is fitted to the navigation that ingest recorded from a bag or a trajectory
-    by time. Each parameter is stated with its σ. A parameter that the flight does not determine is reported as not
-    observable, and is not applied. Parameters requested in ingest (--time-offset auto, --estimate) are applied to
-    the positions and attitudes of later stages; other parameters only with --apply. The survey itself stays as
-    recorded.
+    by time. This gives the time offset (ingest's --time-offset auto), and where boresight or lever arm are to be
+    solved (ingest's --estimate) the values that init-sim3 starts from. Each is stated with its σ. A parameter that
+    the flight does not determine is reported as not observable, and is not applied. The others are applied to the
+    positions and attitudes of later stages. The survey itself stays as recorded.
 
     Positions by photograph, of EXIF or a table with image names, are tested for a lag against the exposures, which
     is applied where lines in two directions show it; --no-apply leaves them as they are.
 
     Examples:
       georef calibrate flight
-      georef calibrate flight --estimate time-offset --max-offset 5
-      georef calibrate flight --estimate time-offset,boresight,lever-arm --apply
+      georef calibrate flight --max-offset 5
+      georef calibrate flight --no-apply
     """
 
-    estimate: RigParameters | None = Field(
-        None,
-        description="Any of time-offset, boresight and lever-arm, with commas (default: those that ingest "
-        "was to estimate).",
-    )
     max_offset: float = Field(
         2.0, gt=0, le=60, description="Search for the time offset up to so many seconds from the present one."
     )
-    apply: bool | None = Field(
-        None,
-        description="Apply all observable estimates, or none (default: those that ingest was to estimate).",
-    )
+    apply: bool = Field(True, description="Apply what is observable to positions and attitudes.")
 
 
 class GeolocateOptions(StageOptions):
@@ -89,11 +70,6 @@ class InitSim3Options(StageOptions):
         None, gt=0, description="Fail if the RMS residual of the camera centres is larger, in metres."
     )
     control_points: bool = Field(True, description="Use the control points.")
-    estimate: EstimatedErrorNames = Field(
-        (),
-        description="Systematic errors to estimate beside the common error of the positions: lever-arm, boresight, "
-        "with a comma; or none.",
-    )
     up: Literal["plane", "photographs"] = Field(
         "plane",
         description="Vertical of a local frame without recorded attitudes: square to the plane of the cameras, or "

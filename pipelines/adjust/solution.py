@@ -12,13 +12,15 @@ from pipelines.adjust.posterior import CommonRows, Posterior, camera_covariances
 from pipelines.adjust.state import State
 from pipelines.adjust.system import Linearised, NormalMatrix, Problem, linearised, posterior_weights, robust_weights
 from pipelines.adjust.terms import At, Attitudes, ControlPoints, Distances, EarlierPoints, Fixes
-from pipelines.core.products import union
+from pipelines.core.products import Remark, union
 from pipelines.core.stages import SIM3_POSTERIOR, TRAIN_POSTERIOR
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.sparse_model import SparseModel
+from pipelines.geometry.statistics import covariance_root
 from pipelines.survey.report import AccuracySummary
+from pipelines.survey.report_parts import EstimatedError
 from pipelines.survey.scene import Scene
 from pipelines.survey.solution import (
     Measurement,
@@ -30,6 +32,7 @@ from pipelines.survey.solution import (
 )
 
 Named = Fixes | ControlPoints | Distances | Attitudes
+_EVIDENT_SIGMAS = 3.0
 _OPEN = 1e-9  # redundancy below which the other observations leave a direction open
 _REJECTED = "is inconsistent with the others at the 99.9 % level"
 
@@ -87,6 +90,22 @@ def _common_rows(near: Linearised, normal: NormalMatrix) -> CommonRows | None:
     weigh = csr_matrix(block_diag(list(weight[:, None, None] * np.swapaxes(term.root_information, 1, 2))))
     by_border = np.pad(weigh @ rows.by_border, ((0, 0), (0, len(normal.corner) - rows.by_border.shape[1])))
     return CommonRows(np.array(term.name, dtype=np.int64), csr_matrix(weigh @ rows.by_poses), by_border)
+
+
+def remarks_of(error: EstimatedError, remedy: str) -> Iterator[Remark]:
+    """Yield a warning if an error exceeds 3 σ, with the remedy, or if it is not observed along every axis."""
+    axes = "east, north, up" if error.name == "lidar-shift" else "right, down, forward"
+    values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
+    evident = [
+        abs(value) > _EVIDENT_SIGMAS * sigma and observed
+        for value, sigma, observed in zip(error.value, error.sigma, error.observed, strict=True)
+    ]
+    if any(evident):
+        evidence = f"The {error.name} of ({values}) {error.unit} {axes} exceeds 3 σ and was removed."
+        yield Remark(code=f"{error.name}-estimated", sentence=evidence, remedy=remedy)
+    elif not all(error.observed):
+        sentence = f"The {error.name} is not observable along every axis: ({values}) {error.unit} {axes}."
+        yield Remark(code=f"{error.name}-not-observable", sentence=sentence)
 
 
 def posterior_of(workspace: Workspace, solution: Solution, sfm: SparseModel) -> Posterior:
@@ -176,7 +195,7 @@ def _left_out(near: Linearised, control: ControlPoints, normal: NormalMatrix) ->
     known = np.linalg.eigvalsh((free + np.swapaxes(free, 1, 2)) / 2)[:, 0] > _OPEN
     rows: list[dict[str, object]] = [{} for _ in known]
     for row in np.flatnonzero(known):
-        unwhiten = np.linalg.cholesky(control.cov[row])
+        unwhiten = covariance_root(control.cov[row])
         error = unwhiten @ np.linalg.solve(free[row], white[row])
         others = np.linalg.solve(np.eye(3) - expected[kind][row] * spread[row], spread[row])
         cov = unwhiten @ (np.eye(3) + (others + others.T) / 2) @ unwhiten.T

@@ -11,9 +11,9 @@ from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.survey.report_parts import EstimatedError
 
-# Priors of lever arm and boresight, in `calibrate` and in the adjustment: wider than any error of a mounting, and
-# finite, so that what a flight leaves open shows by its σ. Wider ones would change no observed value by more than
-# 1 %, and would only enlarge the σ of heights that a downward lever arm takes up.
+# Priors of lever arm and boresight, in the adjustment and in the search for its start: wider than any error of a
+# mounting, and finite, so that what a flight leaves open shows by its σ. Wider ones would change no observed value
+# by more than 1 %, and would only enlarge the σ of heights that a downward lever arm takes up.
 SIGMA_ARM_M, SIGMA_BORESIGHT_RAD = 1.0, float(np.radians(5.0))
 SIGMA_LIDAR_M = 1.0
 # A component counts as observed if its σ is at most this part of the prior's. The prior of a mount only keeps the σ

@@ -217,7 +217,7 @@ PIPELINE: tuple[StageSpec, ...] = (
         options_place="pipelines.adjust.options:CalibrateOptions",
         reads=(MEASURED, *whole_products(SPARSE), ProductPart(TRACK, optional=True)),
         product=RIG,
-        title="Estimate time offset, boresight and lever arm after sfm.",
+        title="Find the time offset, and starts of boresight and lever arm.",
         product_version=2,  # with the lag of positions by photograph
     ),
     StageSpec(

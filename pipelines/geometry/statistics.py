@@ -122,9 +122,14 @@ def squared_mahalanobis(residuals: ArrayLike, covariances: ArrayLike) -> FloatAr
     return np.asarray((r * solved).sum(axis=-1))
 
 
+def covariance_root(covariances: ArrayLike) -> FloatArray:
+    """Return L (…, d, d) with L Lᵀ = Σ, lower triangles, of covariances Σ (…, d, d)."""
+    return np.asarray(np.linalg.cholesky(np.asarray(covariances, dtype=np.float64)))
+
+
 def root_information(covariances: ArrayLike) -> FloatArray:
     """Return W (…, d, d) with WᵀW = Σ⁻¹, which whitens residuals of covariances Σ (…, d, d)."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(np.asarray(covariances, dtype=np.float64))))
+    return np.asarray(np.linalg.inv(covariance_root(covariances)))
 
 
 def typical_sigma(covariances: ArrayLike) -> float:

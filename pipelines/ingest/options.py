@@ -20,7 +20,7 @@ from pipelines.core.options import (
 )
 from pipelines.formats.image_file import HEIF_SUFFIXES, SUFFIXES
 from pipelines.geodesy.vertical import Vertical
-from pipelines.survey.survey import RigParameter, RigParameters, in_usual_order
+from pipelines.survey.survey import MountParameters, RigParameter, in_usual_order
 
 ALL_SENSORS = "all"  # of --sensor: the lenses that expose together
 
@@ -141,10 +141,10 @@ class IngestOptions(StageOptions):
     time_offset: TimeOffset = Field(
         0.0, description="Navigation clock minus camera clock in seconds; auto: estimate it after sfm."
     )
-    estimate: RigParameters | None = Field(
-        None,
-        description="Estimate any of time-offset, boresight and lever-arm (with commas) after sfm, from the SfM "
-        "cameras against the recorded navigation.",
+    estimate: MountParameters = Field(
+        (),
+        description="Solve boresight, lever-arm or both (with a comma) in the adjustment, beside cameras and "
+        "positions; what the flight does not show enlarges the predicted σ.",
     )
     lever_arm: Triple | None = Field(
         None,
@@ -261,7 +261,7 @@ class IngestOptions(StageOptions):
     @property
     def estimated(self) -> tuple[RigParameter, ...]:
         """Parameters of the rig that are to be estimated after sfm, in the usual order."""
-        return in_usual_order((*(self.estimate or ()), *(("time-offset",) if self.time_offset == "auto" else ())))
+        return in_usual_order((*self.estimate, *(("time-offset",) if self.time_offset == "auto" else ())))
 
 
 _BAG_ONLY = ("image_topic", "fix_topic", "attitude_topic", "every", "origin")

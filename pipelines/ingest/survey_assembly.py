@@ -15,6 +15,7 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray, IntArray, Matrix3, vector3
+from pipelines.formats.trajectory_csv import complete
 from pipelines.geodesy import crs, enu
 from pipelines.geodesy.vertical import VerticalDatum
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
@@ -25,7 +26,7 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.readout_times import with_readouts, with_velocities
 from pipelines.ingest.remarks import Remarks, add
-from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, require_estimable
+from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, shown_by
 from pipelines.survey.survey import (
     LOCAL_FRAME,
     Attitude,
@@ -150,8 +151,22 @@ def _to_estimate(
 
     Only the photographs' own motion tells the latter. An InputError: what is asked for was not recorded.
     """
-    if options.estimated:
-        require_estimable(track, options.estimated, "--estimate" if options.estimate else "--time-offset")
+    shown = shown_by(track)
+    if options.time_offset == "auto" and "time-offset" not in shown:
+        raise InputError(
+            "navigation-not-recorded",
+            "needs navigation with times: a --bag, or a --trajectory without a column of image names",
+            field="--time-offset",
+        )
+    if "lever-arm" in options.estimate and not poses.located.any():
+        raise InputError("no-positions", "lever-arm needs positions of the photographs.", field="--estimate")
+    if "boresight" in options.estimate and not complete(poses.enu_from_cam.reshape(-1, 9)).any():
+        raise InputError(
+            "no-attitudes",
+            "boresight needs recorded attitudes, and in a bag the camera's mount.",
+            field="--estimate",
+            remedy="Give --camera-mount YAW,PITCH,ROLL if only the mount is missing.",
+        )
     if poses.coarse_times_m and track is not None and not options.time_offset_s:
         return in_usual_order((*options.estimated, "time-offset"))
     return options.estimated

@@ -1,9 +1,7 @@
 """Survey with its calibrated rig: positions and attitudes recomputed from the recorded navigation."""
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import ClassVar, TypeVar
 
 import numpy as np
@@ -17,7 +15,16 @@ from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.trajectory import Rig, Trajectory, with_rig
 from pipelines.survey.common_points import CommonPoints
-from pipelines.survey.survey import Attitude, Fix, FixLag, RigCalibration, RigParameter, Survey, SurveyImage
+from pipelines.survey.survey import (
+    RIG_PARAMETERS,
+    Attitude,
+    Fix,
+    FixLag,
+    RigCalibration,
+    RigParameter,
+    Survey,
+    SurveyImage,
+)
 
 log = logging.getLogger(__name__)
 
@@ -104,36 +111,17 @@ def load_track(workspace: Workspace) -> NavigationTrack:
     return NavigationTrack.load(path)
 
 
-def require_estimable(track: NavigationTrack | None, wanted: Sequence[RigParameter], field: str) -> None:
-    """Refuse parameters of the rig that the navigation cannot determine.
+def shown_by(track: NavigationTrack | None) -> tuple[RigParameter, ...]:
+    """Return the parameters of the rig that a recorded navigation can show, in their usual order.
 
-    `field` is the option that names them; without a track, the navigation was not recorded by time.
-
-    Raises:
-        InputError: the navigation was not recorded by time; or attitudes, the body's axes or the mount are needed
-            and unknown.
+    The boresight needs recorded attitudes and a mount, the lever arm recorded attitudes and the axes of the body.
     """
-    refusal = partial(InputError, field=field)
     if track is None or len(track.position_time_s) < 2:
-        raise refusal(
-            "navigation-not-recorded",
-            "needs navigation with times: a --bag, or a --trajectory without a column of image names",
-        )
+        return ()
     turned = len(track.attitude_time_s) > 1
-    if "lever-arm" in wanted and not turned:
-        raise refusal("no-attitudes", "lever-arm needs attitudes, which were not recorded")
-    if "lever-arm" in wanted and not track.body_known:
-        raise refusal(
-            "body-axes-unknown",
-            "lever-arm needs the axes of the body.",
-            remedy="Give --camera-mount YAW,PITCH,ROLL.",
-        )
-    mounted = bool(np.isfinite(track.cam_from_body).all(axis=(1, 2)).any())
-    if "boresight" in wanted and not (turned and mounted):
-        raise refusal(
-            "mount-unknown" if turned else "no-attitudes",
-            "boresight needs recorded attitudes, and the camera's mount from /tf or --camera-mount",
-        )
+    mounted = turned and bool(np.isfinite(track.cam_from_body).all(axis=(1, 2)).any())
+    shown = {"time-offset": True, "boresight": mounted, "lever-arm": turned and bool(track.body_known)}
+    return tuple(name for name in RIG_PARAMETERS if shown[name])
 
 
 # A position that is farther from the median of all positions is a blunder.

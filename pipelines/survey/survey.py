@@ -24,6 +24,9 @@ from pipelines.geometry.cameras import Camera
 from pipelines.survey.common_points import CommonPoints
 
 LOCAL_FRAME = "local-frame"  # code of the caution that a survey has no place on Earth
+# What places a camera beside the instruments; the adjustment solves it. The time offset comes before all of that.
+MountParameter = Literal["boresight", "lever-arm"]
+MOUNT_PARAMETERS: tuple[MountParameter, ...] = get_args(MountParameter)
 RigParameter = Literal["time-offset", "boresight", "lever-arm"]
 RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
 # σ of the drift of positions within a session, horizontal and vertical in metres, by kind of receiver, and its time
@@ -39,12 +42,9 @@ def in_usual_order(names: Container[RigParameter]) -> tuple[RigParameter, ...]:
     return tuple(name for name in RIG_PARAMETERS if name in names)
 
 
-# Type of an option that names parameters of the rig.
-RigParameters = Annotated[
-    tuple[RigParameter, ...],
-    from_text(lambda text: listed_names(text, RIG_PARAMETERS)),
-    AfterValidator(in_usual_order),
-    WRITTEN,
+# Type of the option that names parameters of the mount.
+MountParameters = Annotated[
+    tuple[MountParameter, ...], from_text(lambda text: listed_names(text, MOUNT_PARAMETERS)), WRITTEN
 ]
 
 
@@ -389,7 +389,8 @@ class Survey(Product):
         check_points: points that enter no solution.
         assumptions: decisions that `ingest` made where the input states nothing.
         cautions: limits of every result of the survey.
-        estimate: parameters of the rig to be estimated after sfm.
+        estimate: parameters of the rig to be estimated after sfm: the time offset by `calibrate`, the mount by the
+            adjustment.
         default_sigmas: groups of measurements whose σ nobody stated.
         common: points in common with an earlier date, which `sfm` finds; no part of the file.
     """
@@ -485,6 +486,11 @@ class Survey(Product):
     def largest_photograph_px(self) -> tuple[int, int]:
         largest = max(self.cameras, key=lambda camera: camera.width * camera.height)
         return largest.width, largest.height
+
+    @property
+    def unknown_mount(self) -> tuple[MountParameter, ...]:
+        """Parameters of the mount that the adjustment is to solve, in their usual order."""
+        return tuple(name for name in MOUNT_PARAMETERS if name in self.estimate)
 
     @property
     def drifts(self) -> bool:

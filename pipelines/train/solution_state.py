@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
 
 from pipelines.adjust.measurements import problem_of, rejected_of
-from pipelines.adjust.options import EstimatedErrorName
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import adjusted
 from pipelines.adjust.state import State, SystematicErrors
@@ -19,7 +18,7 @@ from pipelines.geometry.rotations import log_so3
 from pipelines.splat.exposure import FrozenExposures
 from pipelines.survey.scene import Scene
 from pipelines.survey.solution import Solution
-from pipelines.survey.survey import Survey
+from pipelines.survey.survey import MOUNT_PARAMETERS, Survey
 
 
 def frozen_exposures(solution: Solution, device: torch.device) -> FrozenExposures | None:
@@ -50,7 +49,7 @@ def measured_problem(
     return problem_of(
         scene,
         survey,
-        estimate=tuple(name for name in get_args(EstimatedErrorName) if name in known),
+        estimate=tuple(name for name in MOUNT_PARAMETERS if name in known),
         with_attitudes=any(one.kind == "attitude" for one in solution.measurements),
         planes=planes,
     )

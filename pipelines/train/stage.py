@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.adjust.posterior import Posterior, load_posterior, save_posterior
+from pipelines.adjust.solution import remarks_of
 from pipelines.adjust.system import minimise
 from pipelines.core.products import Remark, load_json, save_json, save_npz
 from pipelines.core.stages import HELD_OUT, LIDAR, LIDAR_MAP, MODEL, POINTS, SIM3_POSTERIOR, TRAIN_POSTERIOR
@@ -34,7 +35,7 @@ from pipelines.survey.area import boundary_area
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import ImageCache
-from pipelines.survey.report_parts import EstimatedError, LidarReport
+from pipelines.survey.report_parts import LidarReport
 from pipelines.survey.scene import Scene, load_adjusted_scene, photographs
 from pipelines.survey.solution import GeolocatedPoints, LensVignetting, Solution, TrainedModel
 from pipelines.train.compilation import compile_kernels
@@ -57,13 +58,6 @@ from pipelines.train.surface import SceneSurface
 from pipelines.train.trainer import JointTrainer, make_trainer
 
 log = logging.getLogger(__name__)
-
-_EVIDENT_SIGMAS = 3.0
-_CAUSES = {
-    "lever-arm": "`georef ingest --lever-arm` can apply it, in the axes of the body.",
-    "boresight": "`georef ingest --boresight` can apply it.",
-    "lidar-shift": "Check the LiDAR's CRS, datum and flight.",
-}
 
 
 def run(stage: StageRun, options: TrainOptions) -> Summary:
@@ -211,9 +205,11 @@ def _summary(
     if lidar is not None:
         values["lidar"] = lidar.model_dump(mode="json")
     key_figure = f"{model.gaussians} gaussians, train PSNR {psnr:.2f} dB"
-    # Common errors of the fixes, and of an earlier date, are everyday: init-sim3 has told them by its cautions.
-    told = [_warning_of(error) for error in model.estimated_errors if error.name in _CAUSES]
-    warnings = [warning for warning in told if warning is not None]
+    # init-sim3 has told of the others.
+    shifts = [error for error in model.estimated_errors if error.name == "lidar-shift"]
+    warnings = [
+        remark for error in shifts for remark in remarks_of(error, "Check the LiDAR's CRS, datum and flight.")
+    ]
     if record.recovery is not None:
         warnings.append(Remark(code="training-recovered", sentence=record.recovery))
     if lidar is not None:
@@ -226,23 +222,6 @@ def _summary(
         )
         warnings.append(Remark(code="lidar-inconsistent", sentence=sentence))
     return Summary(key_figure, values, tuple(warnings), model.cautions)
-
-
-def _warning_of(error: EstimatedError) -> Remark | None:
-    """Return a warning if the error exceeds 3 σ or is not observable along every axis; else None."""
-    axes = "east, north, up" if error.name == "lidar-shift" else "right, down, forward"
-    values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
-    evident = [
-        abs(value) > _EVIDENT_SIGMAS * sigma and observed
-        for value, sigma, observed in zip(error.value, error.sigma, error.observed, strict=True)
-    ]
-    if any(evident):
-        evidence = f"The {error.name} of ({values}) {error.unit} {axes} exceeds 3 σ and was removed."
-        return Remark(code=f"{error.name}-estimated", sentence=evidence, remedy=_CAUSES[error.name])
-    if not all(error.observed):
-        sentence = f"The {error.name} is not observable along every axis: ({values}) {error.unit} {axes}."
-        return Remark(code=f"{error.name}-not-observable", sentence=sentence)
-    return None
 
 
 def made_in_parts(workspace: Workspace, options: TrainOptions) -> bool:

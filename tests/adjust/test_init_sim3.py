@@ -16,7 +16,7 @@ from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, Inp
 from pipelines.core.products import load_json
 from pipelines.core.runner import run_stage
 from pipelines.core.stages import ADJUSTMENT, BY_NAME, SIM3
-from pipelines.geometry.rotations import log_so3
+from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.solution import GeolocatedPoints, SimilarityEstimate, Solution
@@ -26,6 +26,7 @@ from tests.scenes import (
     GEO_FROM_LOCAL,
     Measured,
     Noise,
+    TrueScene,
     make_scene,
     sparse_model,
     survey_of,
@@ -104,6 +105,55 @@ def test_outlying_fixes_are_listed() -> None:
     sentence = said(warnings, "fix-outliers")
     assert numbers(sentence)[:2] == [4, 24]
     assert all(name in sentence for name in found.gnss_outliers)
+
+
+ARM_M, BORESIGHT_DEG = np.array([0.25, -0.1, 0.15]), np.array([0.7, -0.5, 0.4])
+
+
+def with_mount(survey: Survey, scene: TrueScene) -> Survey:
+    """The survey with positions of an antenna beside the camera, and attitudes of other axes than the camera's."""
+    turned, images = scene.geo_from_cam @ exp_so3(np.radians(BORESIGHT_DEG)).T, []
+    for index, image in enumerate(survey.images):
+        assert image.fix is not None and image.attitude is not None
+        place = image.fix.position_in_geo + scene.geo_from_cam[index] @ ARM_M
+        noise = matrix_from_quat_xyzw(image.attitude.quat_xyzw) @ scene.geo_from_cam[index].T
+        quat = tuple(quat_xyzw_from_matrix(noise @ turned[index]).tolist())
+        images.append(
+            image.model_copy(
+                update={
+                    "fix": image.fix.model_copy(update={"position_in_geo": tuple(place.tolist())}),
+                    "attitude": image.attitude.model_copy(update={"quat_xyzw": quat}),
+                }
+            )
+        )
+    return survey.model_copy(update={"images": tuple(images), "estimate": ("boresight", "lever-arm")})
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_adjustment_solves_the_mount_that_a_survey_leaves_unknown(seed: int) -> None:
+    """Control points fix the scale and height that an arm of an orbit otherwise passes for."""
+    scene, rng = make_scene(points=120), np.random.default_rng(seed)
+    survey = with_mount(survey_of(scene, Noise(), Measured(gcps=True), rng), scene)
+    model = sparse_model(scene, Noise(), rng)
+    points = geolocate(survey, model, GeolocateOptions()).points
+    found, _ = estimated(survey, model, points, CONFIG)
+    assert squared_error(found) < 24.3  # χ²₇ at 0.999
+    errors = {error.name: error for error in found.estimated_errors}
+    for name, truth in (("lever-arm", ARM_M), ("boresight", BORESIGHT_DEG)):
+        sigma = np.array(errors[name].sigma)
+        missed = np.array(errors[name].value) - truth
+        assert (np.abs(missed) < 4 * sigma).all()
+        assert list(errors[name].observed) == (sigma <= 0.1 * np.array(errors[name].prior)).tolist()
+    # 24 attitudes of 0.5° have a mean of 0.1°, and share a rotation of as much; the orbit separates the two.
+    assert max(errors["boresight"].sigma) < 0.5 and max(errors["lever-arm"].sigma) < 0.1
+    # Who does not know of them has them in the residuals.
+    without, _ = estimated(
+        survey.model_copy(update={"estimate": ()}),
+        model,
+        geolocate(survey, model, GeolocateOptions()).points,
+        CONFIG,
+    )
+    assert without.initial.residuals["gnss"].rmse_3d_m > found.initial.residuals["gnss"].rmse_3d_m
 
 
 def test_control_points_alone_carry_the_survey() -> None:

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from pydantic.fields import FieldInfo
 
-from pipelines.adjust.options import InitSim3Options
 from pipelines.core.errors import InputError
 from pipelines.core.options import StageOptions, flag_name, input_paths, load_toml, notation, resolve
 from pipelines.core.stages import PIPELINE
@@ -96,7 +95,8 @@ def test_texts_are_parsed_once() -> None:
     options = resolve(IngestOptions, WRITTEN, {}, TOML)
     assert options.every == Every(2.0, "s")
     assert (options.time_offset, options.time_offset_s) == (-0.25, -0.25)
-    assert options.estimate == options.estimated == ("boresight", "lever-arm")
+    assert set(options.estimate) == {"boresight", "lever-arm"}
+    assert options.estimated == ("boresight", "lever-arm")
     assert (options.lever_arm, options.camera_mount) == ((0.1, 0.0, -0.3), (0.0, -90.0, 0.0))
     assert (options.boresight, options.origin) == ((0.5, 0.3, -1.0), (46.02, 7.75, 1620.0))
     automatic = resolve(IngestOptions, {}, {"time_offset": "auto"}, TOML)
@@ -116,7 +116,7 @@ def test_numbers_and_arrays_of_the_file_are_the_same_options() -> None:
         ("every", "0s", "'0s'"),
         ("time_offset", "soon", "'soon'"),
         ("time_offset", "1e7", "auto"),
-        ("estimate", "focus", "'focus' is none of time-offset, boresight, lever-arm"),
+        ("estimate", "focus", "'focus' is none of boresight, lever-arm"),
         ("lever_arm", "1,2", "'1,2'"),
         ("boresight", "1,2,1e7", "1000000"),
         ("boresight", "1,2,nan", "finite number"),
@@ -196,26 +196,22 @@ def test_presets_leave_room_for_explicit_sizes() -> None:
     assert (options.iterations, options.max_image_size, options.max_gaussians) == (None, None, None)
 
 
-@pytest.mark.parametrize(
-    ("text", "names"),
-    [
-        ("none", ()),
-        (["boresight", "lever-arm"], ("boresight", "lever-arm")),
-        ("boresight,lever-arm", ("boresight", "lever-arm")),
-    ],
-)
-def test_systematic_errors_are_named(text: str | list[str], names: tuple[str, ...]) -> None:
-    options = InitSim3Options(estimate=text)
-    assert options.estimate == names
-    assert InitSim3Options.model_validate(options.model_dump(mode="json")) == options
-
-
-@pytest.mark.parametrize("text", ["drift", "bias", ""])
-def test_systematic_errors_that_cannot_be(text: str) -> None:
+@pytest.mark.parametrize("text", ["drift", "bias", "time-offset", ""])
+def test_parameters_of_the_mount_that_cannot_be(text: str) -> None:
     with refused("option-invalid", InputError) as error:
-        resolve(InitSim3Options, {}, {"estimate": text}, Path("georef.toml"))
+        resolve(IngestOptions, {}, {"estimate": text}, TOML)
     assert error.value.field == "--estimate"
-    assert f"{text!r} is none of lever-arm, boresight" in error.value.message
+    assert f"{text!r} is none of boresight, lever-arm" in error.value.message
+
+
+@pytest.mark.parametrize("stage", ["calibrate", "init-sim3"])
+def test_the_mount_is_named_to_ingest_alone(tmp_path: Path, stage: str) -> None:
+    requests = tmp_path / "requests.json"
+    requests.write_text(json.dumps({stage: {"estimate": ["boresight"]}}), encoding="utf-8")
+    with refused("unknown-option", InputError) as error:
+        resolve(OPTIONS[stage], {}, {"estimate": ["boresight"]}, tmp_path / "georef.toml")
+    assert (error.value.field, str(requests) in error.value.remedy) == ("--estimate", True)
+    assert [name for name, options in OPTIONS.items() if "estimate" in options.model_fields] == ["ingest"]
 
 
 def test_toml_nested_too_deeply_is_refused(tmp_path: Path) -> None:

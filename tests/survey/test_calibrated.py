@@ -14,7 +14,7 @@ from pipelines.core.products import load_json, save_json, save_npz
 from pipelines.core.stages import RIG, SURVEY, TRACK
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.survey.calibrated import NavigationTrack, apply_calibration, load_survey, require_estimable
+from pipelines.survey.calibrated import NavigationTrack, apply_calibration, load_survey, shown_by
 from pipelines.survey.survey import Attitude, RigCalibration, RigEstimate, RigParameter, Survey, SurveyImage
 from tests.refusals import refused
 from tests.scenes import Measured, Noise, make_scene, survey_of
@@ -214,21 +214,20 @@ class TestLoadSurvey:
 
 
 @pytest.mark.parametrize(
-    ("change", "wanted", "code"),
+    ("change", "shown"),
     [
-        (None, "time-offset", "navigation-not-recorded"),
-        ({"attitude_time_s": np.empty(0)}, "lever-arm", "no-attitudes"),
-        ({"attitude_time_s": np.empty(0)}, "boresight", "no-attitudes"),
-        ({"body_known": np.array(False)}, "lever-arm", "body-axes-unknown"),
-        ({"cam_from_body": np.full((COUNT, 3, 3), np.nan)}, "boresight", "mount-unknown"),
+        ({}, ("time-offset", "boresight", "lever-arm")),
+        ({"position_time_s": np.empty(0)}, ()),
+        ({"attitude_time_s": np.empty(0)}, ("time-offset",)),
+        ({"body_known": np.array(False)}, ("time-offset", "boresight")),
+        ({"cam_from_body": np.full((COUNT, 3, 3), np.nan)}, ("time-offset", "lever-arm")),
     ],
 )
-def test_what_cannot_be_estimated(
-    track: NavigationTrack, change: dict[str, np.ndarray] | None, wanted: RigParameter, code: str
+def test_a_navigation_shows_what_it_has_recorded(
+    track: NavigationTrack, change: dict[str, np.ndarray], shown: tuple[RigParameter, ...]
 ) -> None:
-    given = None if change is None else replace(track, **change)
-    with refused(code, InputError):
-        require_estimable(given, [wanted], "--estimate")
+    assert shown_by(replace(track, **change)) == shown
+    assert shown_by(None) == ()
 
 
 @pytest.mark.parametrize(

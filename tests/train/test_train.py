@@ -271,9 +271,15 @@ def with_control(workspace: Workspace, offset_m: tuple[float, float, float] = BI
         assert image.fix is not None
         place = tuple(a + b for a, b in zip(image.fix.position_in_geo, offset_m, strict=True))
         images.append(image.model_copy(update={"fix": image.fix.model_copy(update={"position_in_geo": place})}))
-    update = {"images": tuple(images), "control_points": survey.check_points, "check_points": ()}
+    estimate = ("boresight", "lever-arm")
+    update = {
+        "images": tuple(images),
+        "control_points": survey.check_points,
+        "check_points": (),
+        "estimate": estimate,
+    }
     save_json(survey.model_copy(update=update), workspace.root / SURVEY)
-    adjust_workspace(workspace, InitSim3Options(accept_inconsistency=True, estimate=("lever-arm", "boresight")))
+    adjust_workspace(workspace, InitSim3Options(accept_inconsistency=True))
     return workspace
 
 

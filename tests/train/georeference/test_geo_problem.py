@@ -79,7 +79,7 @@ def adjusted(noise: Noise = NOISE, estimate: tuple[str, ...] = ()) -> Adjusted:
 
 def of_survey(survey: Survey, sparse: object, estimate: tuple[str, ...] = ()) -> Adjusted:
     points = geolocate(survey, sparse, GeolocateOptions()).points  # type: ignore[arg-type]
-    options = InitSim3Options(accept_inconsistency=True, estimate=estimate)  # type: ignore[arg-type]
+    options, survey = InitSim3Options(accept_inconsistency=True), survey.model_copy(update={"estimate": estimate})
     posterior, _ = estimate_similarity(survey, sparse, points, options)  # type: ignore[arg-type]
     solution = posterior.solution
     weighted = solution.weighted(survey)
