@@ -121,7 +121,7 @@ def survey_and_track(
         remarks.assume(
             "rig-as-given",
             f"{', '.join(options.estimated)}: the given value is used until it is estimated after sfm.",
-            "`georef run` or `georef calibrate` estimates it.",
+            "`georef run` estimates it.",
         )
     ground = read_ground_files(options, remarks)  # ahead of the photographs, which take minutes
     names = {point.name for file in ground if file is not None for point in file.points} | ends_of(options)
