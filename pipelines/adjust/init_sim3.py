@@ -158,6 +158,9 @@ def _figures(solution: Solution, *, is_local: bool) -> tuple[str, dict[str, Any]
     ]
     position = float(np.linalg.norm(sigma[4:]))
     figure = f"σ of the georeference alone {position:.3f} m; residuals {', '.join(parts)}"
+    figure += "".join(
+        f"; {error.name} {error.text}" for error in solution.estimated_errors if error.name in _OF_MOUNT
+    )
     if earlier is not None:
         figure += f"; tied to {Path(earlier.workspace).name} by {earlier.used} of {earlier.points} points in common"
     if is_local:

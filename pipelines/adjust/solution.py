@@ -94,17 +94,15 @@ def _common_rows(near: Linearised, normal: NormalMatrix) -> CommonRows | None:
 
 def remarks_of(error: EstimatedError, remedy: str) -> Iterator[Remark]:
     """Yield a warning if an error exceeds 3 σ, with the remedy, or if it is not observed along every axis."""
-    axes = "east, north, up" if error.name == "lidar-shift" else "right, down, forward"
-    values = ", ".join(f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(error.value, error.sigma, strict=True))
     evident = [
         abs(value) > _EVIDENT_SIGMAS * sigma and observed
         for value, sigma, observed in zip(error.value, error.sigma, error.observed, strict=True)
     ]
     if any(evident):
-        evidence = f"The {error.name} of ({values}) {error.unit} {axes} exceeds 3 σ and was removed."
+        evidence = f"The {error.name} of {error.text} exceeds 3 σ and was removed."
         yield Remark(code=f"{error.name}-estimated", sentence=evidence, remedy=remedy)
     elif not all(error.observed):
-        sentence = f"The {error.name} is not observable along every axis: ({values}) {error.unit} {axes}."
+        sentence = f"The {error.name} is not observable along every axis: {error.text}."
         yield Remark(code=f"{error.name}-not-observable", sentence=sentence)
 
 

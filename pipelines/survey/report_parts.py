@@ -340,3 +340,10 @@ class EstimatedError(Product):
     sigma: Vector3
     prior: Vector3
     observed: tuple[bool, bool, bool]
+
+    @property
+    def text(self) -> str:
+        """Values with their σ: `(+0.251 ± 0.012, -0.098 ± 0.011, +0.150 ± 0.030) m right, down, forward`."""
+        axes = "right, down, forward" if self.name in ("lever-arm", "boresight") else "east, north, up"
+        values = (f"{value:+.3f} ± {sigma:.3f}" for value, sigma in zip(self.value, self.sigma, strict=True))
+        return f"({', '.join(values)}) {self.unit} {axes}"

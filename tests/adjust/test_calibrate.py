@@ -29,6 +29,7 @@ from pipelines.survey.calibrated import load_survey
 from pipelines.survey.survey import RigCalibration, Survey
 from tests import bags
 from tests.earth import enu_from_lla
+from tests.refusals import numbers
 from tests.scenes import Noise, TrueScene, sparse_model
 
 pytestmark = pytest.mark.usefixtures("children_here")  # a model is taken over in each test
@@ -153,6 +154,7 @@ def test_run_estimates_after_sfm_and_goes_on(tmp_path: Path, command: Command, w
     # The adjustment goes on from there: of the boresight of 0.95° next to nothing is left, and it observes that.
     (left,) = (row for row in stages["init-sim3"]["values"]["estimated_errors"] if row["name"] == "boresight")
     assert np.abs(left["value"]).max() < 0.1 and left["observed"] == [True] * 3
+    assert numbers(stages["init-sim3"]["key_figure"])[-6::2] == pytest.approx(left["value"], abs=6e-4)
     # The survey stays as recorded: positions were 3 m off.
     recorded, applied = load_json(Survey, workspace / SURVEY), load_survey(Workspace(workspace))
     shift_m = [
