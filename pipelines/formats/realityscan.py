@@ -2,8 +2,9 @@
 
 `#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2`, in any order, with `f` in millimetres of a 36 mm wide
 film, `px` and `py` as shares of the longer side from the middle of the image, and Brown's terms (t1, t2 in OpenCV's
-order). World ← camera (x right, y up, z backward) is R_z(−heading) R_x(pitch) R_y(roll) with x east, y north, z up:
-pitch 0 looks straight down. The scale of `px` and `py` is documented nowhere, and assumed.
+order). From RealityScan 2 on, the same columns are called `yaw`, `f_35mm`, `px_norm` and `py_norm`. World ← camera
+(x right, y up, z backward) is R_z(−heading) R_x(pitch) R_y(roll) with x east, y north, z up: pitch 0 looks straight
+down. RealityScan's own templates (calibration.xml) multiply f / 36, px and py by one scale to pixels.
 """
 
 from __future__ import annotations
@@ -14,9 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipelines.core.errors import InputError
-from pipelines.core.products import Remark
 from pipelines.core.types import FloatArray
-from pipelines.formats import tables
+from pipelines.formats import column_names, tables
 from pipelines.formats.camera_files import CAM_FROM_GL
 from pipelines.formats.solved_cameras import PhotoSize, SolvedCameras, SolvedPhotograph, not_placed, solved_cameras
 from pipelines.geometry.lens_fit import Brown, ForeignLens, brown_lens
@@ -30,17 +30,18 @@ _VOCABULARY = {
     **{name: name for name in ("x", "y", "pitch", "roll", "f", "px", "py", *_LENS)},
     **dict.fromkeys(("alt", "z", "altitude"), "alt"),
     **dict.fromkeys(("heading", "yaw"), "heading"),
-    **dict.fromkeys(("focal", "focallength"), "f"),
+    **dict.fromkeys(("focal", "focallength", "f35mm"), "f"),
+    "pxnorm": "px",
+    "pynorm": "py",
 }
-_SAID_PX = 1.0
 _WIDEST_FLIGHT_DEG = 0.5
 
 
 def header_line(lines: list[tuple[int, str]]) -> tuple[int, str] | None:
     """Return number and text of the line that names the columns, or None: this is no such table."""
     for number, text in lines[:5]:
-        cells = {cell.strip().lstrip("#").strip().lower() for cell in text.split(",")}
-        if {"heading", "pitch", "roll", "f"} <= cells:
+        meanings = {column_names.meaning_of(cell, _VOCABULARY) for cell in text.lstrip("# ").split(",")}
+        if {"heading", "pitch", "roll", "f"} <= meanings:
             return number, text
     return None
 
@@ -64,7 +65,7 @@ def read_camera_csv(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     kept = [(at, line) for at, line in lines if at > number and not line.startswith("#")]
     rows = tables.table_rows(path, kept, ",", columns)
     tables.require_rows(rows, path)
-    photographs, lenses, most = [], {}, 0.0
+    photographs, lenses = [], {}
     for row in rows:
         name = row.named("name")
         angles = [-row.finite("heading"), row.finite("pitch"), row.finite("roll")]
@@ -79,17 +80,10 @@ def read_camera_csv(path: Path, photo_size: PhotoSize) -> SolvedCameras:
                     "focal-length-impossible", f"a focal length of {focal_mm:g} mm is not above zero", "f"
                 )
             lenses[key] = _lens(size, focal_mm, values)
-            most = max(most, max(size) * max(abs(values["px"]), abs(values["py"])))
         center = np.array([row.finite("x"), row.finite("y"), row.finite("alt")])
         photographs.append(SolvedPhotograph(name, key, world_from_gl @ CAM_FROM_GL.T, center))
     _refuse_degrees(np.array([photograph.center_in_world for photograph in photographs]), path)
     remarks = [not_placed(PROGRAM, "the coordinate system of its export")]
-    if most > _SAID_PX:
-        sentence = (
-            "px and py are assumed to be shares of the picture's longer side: they move the principal point by up "
-            f"to {most:.1f} px."
-        )
-        remarks.append(Remark(code="principal-point-assumed", sentence=sentence))
     return solved_cameras(path, PROGRAM, photographs, lenses, photo_size, remarks=remarks)
 
 

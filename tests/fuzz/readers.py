@@ -28,6 +28,7 @@ from pipelines.core.staleness import status
 from pipelines.core.workspace import Manifest, Workspace
 from pipelines.formats.bag import COMPRESSED, IMAGE, BadImageError, ImageWriter, UndecodableError, open_bag
 from pipelines.formats.colmap import pycolmap_module, read_sparse
+from pipelines.formats.depth_image import read_depth_image
 from pipelines.formats.e57 import open_e57
 from pipelines.formats.exif import read_tags
 from pipelines.formats.georef_sidecar import GeorefSidecar, sidecar_path, write_sidecar
@@ -496,6 +497,7 @@ READERS: dict[str, Reader] = {
         _e57, lambda folder: [_attempt(lambda p=p: list(open_e57(p).chunks(9))) for p in folder.iterdir()]
     ),
     "meshes": Reader(_meshes, _read_clouds),
+    "depth-maps": Reader(_depth_maps, _each(read_depth_image)),
     "splat-ply": Reader(_splat, lambda folder: read_splat_ply(folder / "a.ply")),
     "sidecar": Reader(_sidecar, _read_sidecar),
     "products": Reader(_products, _read_products),

@@ -266,6 +266,19 @@ def test_columns_of_realityscan_in_any_order(surveyed: tuple[SparseModel, Survey
     assert_same_cameras(solved(path).model, model)
 
 
+def test_columns_of_realityscan_have_other_names_since_its_second_version(
+    surveyed: tuple[SparseModel, Survey], tmp_path: Path
+) -> None:
+    model, _ = surveyed
+    path = write.realityscan(model, tmp_path / "a.csv")
+    rows = path.read_text().splitlines()[1:]
+    header = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
+    path.write_text("\n".join([header, *rows]) + "\n")
+    found = solved(path)
+    assert_same_cameras(found.model, model)
+    assert codes(found.remarks) == ["georeference-not-taken"]
+
+
 def _edited(path: Path, edit: Callable[[str], str]) -> Path:
     path.write_text(edit(path.read_text()))
     return path
