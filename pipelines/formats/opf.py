@@ -156,12 +156,17 @@ def read_opf(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     photograph_of: dict[int, int] = {}
     for camera in calibration.cameras:
         if camera.id not in names:
-            message = f"The camera list has no file for the calibrated camera {camera.id}."
-            raise InputError("image-missing", message, path=path, field="camera_list")
+            continue
         photograph_of[camera.id] = len(photographs)
         rotation, center = map_from_cam(camera.orientation_deg), np.array(camera.position)
         photographs.append(SolvedPhotograph(names[camera.id], str(camera.sensor_id), rotation, center))
     lenses = {str(sensor.id): _lens(sensor, sizes, path) for sensor in calibration.sensors}
+    if unlisted := [camera.id for camera in calibration.cameras if camera.id not in names]:
+        sentence = (
+            f"{len(unlisted)} of {len(calibration.cameras)} calibrated cameras are left out: the camera list has "
+            f"no file for them (such as {unlisted[0]})."
+        )
+        remarks.append(Remark(code="cameras-without-file", sentence=sentence))
     rolling = [camera for camera in calibration.cameras if any(camera.rolling_shutter or ())]
     if rolling:
         sentence = f"The rolling shutter of {len(rolling)} cameras is solved: poses are taken, the motion is not."

@@ -25,6 +25,7 @@ from pipelines.formats.solved_cameras import Foreign, TiePoints, vector_of
 
 MATCHES = "OPF_mesh_primitive_matches"
 _MOST_BUFFER_BYTES = 16 << 30
+_MOST_SHARED = 4  # observations for each match and point of a file: the specification's own example has 2.5
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _FLOAT, _UNSIGNED, _BYTE = 5126, 5125, 5121
 _DTYPES: dict[int, np.dtype[Any]] = {_FLOAT: np.dtype("<f4"), _UNSIGNED: np.dtype("<u4"), _BYTE: np.dtype("u1")}
@@ -176,8 +177,9 @@ def _part(
     offset, count = packed[:, 0] | (packed[:, 1] & 0xFF) << 32, packed[:, 1] >> 8
     fits = (offset + count <= len(owner)) | (count == 0)
     sound = len(packed) == len(position) and len(owner) == len(pixels) and fits.all()
-    # Ranges do not overlap: forged ones could ask for each match as often as there are points.
-    if not sound or count.sum() > len(owner) or (len(owner) and owner.max() >= len(matches.camera_uids)):
+    # Points may share matches, but forged ranges could ask for each match as often as there are points.
+    most = _MOST_SHARED * (len(owner) + len(packed))
+    if not sound or count.sum() > most or (len(owner) and owner.max() >= len(matches.camera_uids)):
         message = "Points, ranges of matches, cameras and pixels do not fit each other."
         raise InputError("file-damaged", message, path=file.path, field=MATCHES)
     point = np.repeat(np.arange(len(position)), count)

@@ -279,6 +279,34 @@ def test_columns_of_realityscan_have_other_names_since_its_second_version(
     assert codes(found.remarks) == ["georeference-not-taken"]
 
 
+def test_cameras_of_opf_without_a_file_are_left_out(surveyed: tuple[SparseModel, Survey], tmp_path: Path) -> None:
+    """As in the project that the specification gives as an example."""
+    model, _ = surveyed
+    path = write.opf(model, tmp_path / "opf")
+    listed = path.with_name("camera-list.json")
+    document = json.loads(listed.read_text())
+    del document["cameras"][1]
+    listed.write_text(json.dumps(document))
+    found = solved(path)
+    assert "cameras-without-file" in codes(found.remarks)
+    rest = np.delete(np.arange(6), 1)
+    np.testing.assert_allclose(found.model.rotation_cam_from_local, model.rotation_cam_from_local[rest], atol=1e-6)
+    assert len(found.model.obs_point) == len(model.of_images(rest).obs_point)
+
+
+def test_points_of_opf_may_share_matches(surveyed: tuple[SparseModel, Survey], tmp_path: Path) -> None:
+    """As in the glTF that the specification gives as an example."""
+    path = write.opf(surveyed[0], tmp_path / "opf")
+    file = path.with_name("ranges.bin")
+    ranges = np.frombuffer(file.read_bytes(), "<u4").reshape(-1, 2).copy()
+    ranges[1] = ranges[0]
+    file.write_bytes(ranges.tobytes())
+    found = solved(path).model
+    first, second = (found.obs_xy_px[found.obs_point == point] for point in (0, 1))
+    np.testing.assert_array_equal(first, second)
+    assert len(first) > 1
+
+
 def _edited(path: Path, edit: Callable[[str], str]) -> Path:
     path.write_text(edit(path.read_text()))
     return path
