@@ -85,6 +85,12 @@ class Shared:
         return np.asarray(first + second - 2 * common)
 
 
+def same_photographs(before: Survey, after: Survey) -> tuple[str, ...]:
+    """Return the names in the later survey of the photographs that are in both, by their content."""
+    there = {image.sha256 for image in before.images if image.sha256}
+    return tuple(image.name for image in after.images if image.sha256 in there)
+
+
 def shared_by(before: Survey, after: Survey, *, same_base: bool) -> Shared:
     """Return what two surveys share: control points of one name and place, and the base if the user says so."""
     there = {point.name: point for point in before.control_points}

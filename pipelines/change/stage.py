@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipelines.change.along_normals import Datum, change_along_normals, require_clouds
 from pipelines.change.by_date import Ground, volumes_by_date
-from pipelines.change.datum import load_epoch, shared_by
+from pipelines.change.datum import Epoch, load_epoch, same_photographs, shared_by
 from pipelines.change.detection import (
     QUANTILE_95,
     Noise,
@@ -56,6 +56,7 @@ from pipelines.survey.change_report import Change, ChangedRegion, EpochShift, Re
 _PLACES = 20  # along each side of the rasters, which stand for the survey
 _ROOM = __name__.rpartition(".")[0]
 _MOST_LEVELS = 1_000_000  # of detection, whose median is stated
+_MOST_TWICE = 0.5  # of the photographs of an epoch: more are one flight
 DOUBTED = "region-contradicted"  # reason of doubtful regions, and code of their warning
 _KINDS = {
     "difference": RasterKind("float32", (Band("later minus earlier height", "metre"),)),
@@ -71,7 +72,8 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     """Write the change and return its figures.
 
     Raises:
-        InputError: the σ of the datum is not known, and no registration was asked for.
+        InputError: the σ of the datum is not known, and no registration was asked for; or both epochs are one
+            flight.
         DegenerateGeometryError: both epochs have too little unchanged ground in common.
     """
     workspaces = Workspace(options.before), stage.workspace
@@ -79,6 +81,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     epochs = load_epoch(workspaces[0]), load_epoch(workspaces[1])
     if options.along_normals:
         require_clouds(workspaces)
+    twice = tuple(_twice(epochs, workspaces[0]))
     registered = options.is_registered
     tied, solved_again = tied_by(epochs, workspaces)
     for one, workspace in zip(epochs, workspaces, strict=True):
@@ -134,7 +137,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     remove(parts.folder)
     cautions = tuple(one.cautions for one in epochs)
     stale = tuple(remark for one in workspaces for remark in _stale_rasters(one))
-    warnings = (*stale, *solved_again, *left_out, *_doubted(change, found, doubtful, partly))
+    warnings = (*stale, *twice, *solved_again, *left_out, *_doubted(change, found, doubtful, partly))
     summary = _summary(change, warnings, union(*cautions))
     compared = Compared(stage.out, change, found.polygons, grid, workspaces, tied, doubtful.polygons)
     page = change_page(compared, summary.warnings, cautions, stage.progress)
@@ -160,6 +163,28 @@ def _registration_of(noise: Noise, *, applied: bool, datum_v_m: float) -> EpochS
         stable_share=noise.share,
         contradicts=not applied and abs(float(noise.shift_m[2])) > limit,
     )
+
+
+def _twice(epochs: tuple[Epoch, Epoch], before: Workspace) -> Iterator[Remark]:
+    """Yield a warning if some photographs are in both epochs: ground that they show has not changed between them.
+
+    Raises:
+        InputError: most of an epoch's photographs are the other's; the surfaces then differ by training alone.
+    """
+    surveys = [epoch.survey for epoch in epochs]
+    names = same_photographs(*surveys)
+    if len(names) > _MOST_TWICE * min(len(survey.images) for survey in surveys):
+        message = (
+            f"has {len(names)} of its {len(surveys[0].images)} photographs in common with the later survey: both "
+            "are of one flight, and their surfaces differ by the errors of two solutions alone."
+        )
+        raise InputError("same-photographs", message, path=before.root)
+    if names:
+        sentence = (
+            f"{len(names)} photographs of the later survey are in the earlier one, too: {listed(names)}. They show "
+            "no change between the epochs."
+        )
+        yield Remark(code="photographs-in-both", sentence=sentence, remedy="Remove them from one of the surveys.")
 
 
 def _stale_rasters(workspace: Workspace) -> Iterator[Remark]:
@@ -357,8 +382,9 @@ def _write_vectors(
         _write_geojson(folder / "doubtful.geojson", change.doubtful, doubtful, grid)
     if change.by_date:
         replace_text(folder / "by_date.csv", table_text(_rows_by_date(change)))
-    rows = [region.model_dump() for region in change.regions]
-    write_polygons_gpkg(folder / "regions.gpkg", "regions", polygons, rows, grid.frame.wkt)
+    rows, doubted = ([region.model_dump() for region in each] for each in (change.regions, change.doubtful))
+    layers = {"regions": (polygons, rows), **({"doubtful": (doubtful, doubted)} if doubtful else {})}
+    write_polygons_gpkg(folder / "regions.gpkg", layers, grid.frame.wkt)
     heads = list(ChangedRegion.model_fields)
     replace_text(folder / "regions.csv", table_text([heads, *([row[name] for name in heads] for row in rows)]))
 

@@ -194,9 +194,14 @@ def read_contours(path: Path) -> tuple[str, list[ContourLine]]:
     return wkt, lines
 
 
-def read_regions(path: Path, columns: Sequence[str]) -> tuple[str, list[Any], list[tuple[Any, ...]]]:
-    """Return the CRS as WKT, polygons and some columns of the regions of `georef change`, as `read_contours`."""
-    return _read_gpkg(path, "regions", columns, "georef change")
+def read_regions(
+    path: Path, columns: Sequence[str], *, doubtful: bool = False
+) -> tuple[str, list[Any], list[tuple[Any, ...]]]:
+    """Return the CRS as WKT, polygons and some columns of the regions of `georef change`, as `read_contours`.
+
+    `doubtful`: of the layer of regions that count as no change.
+    """
+    return _read_gpkg(path, "doubtful" if doubtful else "regions", columns, "georef change")
 
 
 def _read_gpkg(
@@ -216,12 +221,13 @@ def _read_gpkg(
         raise InputError(f"{layer}-unreadable", message, path=path, remedy=remedy) from error
 
 
-def write_polygons_gpkg(path: Path, layer: str, polygons: Sequence[Any], rows: Sequence[Json], wkt: str) -> None:
-    """Write polygons with a row of attributes each as a GeoPackage 1.2 of one layer."""
-    shapes = [shapely.MultiPolygon(shapely.get_parts(one)) for one in polygons]
-    columns = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+def write_polygons_gpkg(path: Path, layers: Mapping[str, tuple[Sequence[Any], Sequence[Json]]], wkt: str) -> None:
+    """Write layers of polygons, with a row of attributes each, as a GeoPackage 1.2."""
     with _new_gpkg(path) as draft:
-        _add_layer(draft, layer, shapes, columns, kind="MultiPolygon", crs=wkt)
+        for layer, (polygons, rows) in layers.items():
+            shapes = [shapely.MultiPolygon(shapely.get_parts(one)) for one in polygons]
+            columns = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+            _add_layer(draft, layer, shapes, columns, kind="MultiPolygon", crs=wkt)
 
 
 def write_contours_dxf(path: Path, lines: Sequence[ContourLine]) -> None:

@@ -3,11 +3,14 @@
 The earlier workspace is read and never written. Its features come from its database, its cameras and points from
 its solution. A pair of tracks is common if verified matches tie them, and if it fits the similarity that most pairs
 agree on. Ground that has changed has few such pairs, and no part of the ground has more of a say than another.
+
+Where too few pairs agree, or all in one corner, SIFT's features are matched again by looser tests, between more
+photographs, and then the learned features that both dates have: of another season, SIFT finds next to nothing.
 """
 
 import logging
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -21,12 +24,13 @@ from scipy.spatial import cKDTree
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.relative import Solved
 from pipelines.adjust.solution import posterior_of
-from pipelines.adjust.tied import common_similarity
+from pipelines.adjust.tied import FEW_COMMON, NARROW_SPREAD, common_similarity
 from pipelines.core.errors import DamagedPartialError, DegenerateGeometryError, InputError
 from pipelines.core.machine import chosen_threads
+from pipelines.core.plan import photograph_folder
 from pipelines.core.products import is_checked
 from pipelines.core.progress import Progress
-from pipelines.core.stages import SPARSE
+from pipelines.core.stages import SPARSE, SURVEY
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import flatten, load_reconstruction
@@ -34,12 +38,13 @@ from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, lla_of
 from pipelines.geometry.cameras import ColmapDatabase, Reconstruction
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.sfm.colmap_database import FEATURES, copy_rows, drop_added_features, remove_database
-from pipelines.sfm.features import MAX_ANGLE_DEG, SfmJob, spread_of, steps, verification
+from pipelines.sfm.colmap_database import FEATURES, add_features, copy_rows, drop_added_features, remove_database
+from pipelines.sfm.features import MAX_ANGLE_DEG, SfmJob, masks_beside, spread_of, steps, verification
+from pipelines.sfm.learned_weights import missing_for_learned
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.common_points import CommonPoints, solution_hash
 from pipelines.survey.solution import read_sfm, read_solution
-from pipelines.survey.survey import Survey
+from pipelines.survey.survey import Survey, SurveyImage
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +56,9 @@ _LEAST = 8  # points in common: fewer agree by chance, and check nothing
 _LEAST_MATCHES = 15  # verified ones of a pair, as COLMAP's own mapper asks for
 _BLOCKS = 12  # along the longer side of the ground in common
 _SPREAD_BLOCKS = 6
+_LEAST_SHARE = 0.1  # of the pairs of tracks: three of them agree with one in a hundred of any others
+_SAME_PX = 0.5  # between learned features found again and those in a database
+_LOOSE_RATIO = 0.9  # of the distances of a descriptor to the nearest two, where SIFT's own is 0.8
 _MOST = 600  # points: more say nothing new of some dozen modes of deformation, and cost time in every stage
 _REACH = 3.0  # heights of flight between a photograph and the nearest of the other date
 _FARTHEST_M = 30.0  # between the positions of both dates beyond that reach: consumer receivers err by metres
@@ -132,31 +140,37 @@ def tie_to_earlier(
         DegenerateGeometryError: too few points are common; says how far the search came.
         InputError: the features of the earlier date cannot be read.
     """
-    pairs = pairs_across(job.survey, model, earlier)
+    flat, best = flatten(model), _Ties.none()
     with _both_dates(colmap, job, model, earlier) as dates:
-        tied = dates.matched(colmap, job, pairs, progress)
-    chosen = tied.agreeing(flatten(model), earlier)
-    if chosen is None or len(chosen.later) < _LEAST:
-        found = 0 if chosen is None else len(chosen.later)
+        for name, tied in dates.rounds(colmap, job, progress):
+            ties = tied.agreeing(flat, earlier)
+            log.info(
+                "%s: %d points tie the dates, of %d verified matches in %d pairs; they cover %.0f %% of the ground "
+                "in common.", name, len(ties), ties.matches, ties.pairs, 100 * ties.spread,
+            )  # fmt: skip
+            best = ties if best.pairs == 0 or len(ties) > len(best) else best
+            if len(best) >= FEW_COMMON and best.spread >= NARROW_SPREAD:
+                break
+    if len(best) < _LEAST:
         message = (
-            f"{len(pairs)} pairs of photographs across the dates have {tied.matches} verified matches, which "
-            f"tie {found} points that agree; {_LEAST} are needed. Nothing on the ground looks the same at both "
+            f"{best.pairs} pairs of photographs across the dates have {best.matches} verified matches, which "
+            f"tie {len(best)} points that agree; {_LEAST} are needed. Nothing on the ground looks the same at both "
             "dates, or scale, season or light differ too much."
         )
-        remedy = "Try a larger --max-features, or solve this date alone: --forget earlier."
+        remedy = (
+            "Solve both dates with --features learned, which finds what a season leaves, or with a larger "
+            "--max-features. Or solve this date alone: --forget earlier."
+        )
         raise DegenerateGeometryError("earlier-not-tied", message, remedy=remedy)
-    points = _placed(chosen, earlier)
-    log.info(
-        "%d points tie the dates, of %d verified matches in %d pairs; they cover %.0f %% of the ground in common.",
-        len(points), tied.matches, len(pairs), 100 * float(points.spread),
-    )  # fmt: skip
-    return points
+    return _placed(best, earlier)
 
 
-def pairs_across(survey: Survey, model: Reconstruction, earlier: SolvedDate) -> list[tuple[int, int]]:
+def pairs_across(
+    survey: Survey, model: Reconstruction, earlier: SolvedDate, neighbours: int
+) -> list[tuple[int, int]]:
     """Return the pairs (later image id, index of an earlier camera) that may show the same place.
 
-    Few pairs are all taken. Otherwise, half of a photograph's partners are the nearest that look in a similar
+    Few pairs are all taken. Otherwise, half of a photograph's `neighbours` are the nearest that look in a similar
     direction, and the others are the nearest in each of eight directions. Without a position it has none.
     """
     ids = sorted(model.reg_image_ids())
@@ -170,11 +184,11 @@ def pairs_across(survey: Survey, model: Reconstruction, earlier: SolvedDate) -> 
         here = position[image_id - 1]
         if not np.isfinite(here).all():
             continue
-        near = np.atleast_1d(tree.query(here, k=min(count, _NEIGHBOURS * _NEIGHBOURS))[1])
+        near = np.atleast_1d(tree.query(here, k=min(count, _NEIGHBOURS * neighbours))[1])
         looks_away = earlier.axis_in_ecef[near] @ axis[image_id - 1] < np.cos(np.radians(MAX_ANGLE_DEG))
         near = near[~looks_away]  # unknown (NaN) passes
         offset = (earlier.center_in_ecef[near] - here) @ turn
-        pairs += [(image_id, int(near[row])) for row in spread_of(offset, _NEIGHBOURS)]
+        pairs += [(image_id, int(near[row])) for row in spread_of(offset, neighbours)]
     return pairs
 
 
@@ -199,22 +213,34 @@ class _Ties:
     earlier: IntArray
     votes: IntArray
     matches: int  # verified ones, of all features
+    pairs: int  # of photographs
     spread: float = 0.0
 
-    def agreeing(self, model: SparseModel, earlier: SolvedDate) -> "_Ties | None":
-        """Return the pairs that agree on a similarity, thinned to an even number in each block; None: none does."""
+    @classmethod
+    def none(cls) -> "_Ties":
+        nothing = np.zeros(0, dtype=np.int64)
+        return cls(nothing, nothing, nothing, 0, 0)
+
+    def __len__(self) -> int:
+        return len(self.later)
+
+    def agreeing(self, model: SparseModel, earlier: SolvedDate) -> "_Ties":
+        """Return the pairs that agree on a similarity, thinned to an even number in each block; none: by chance."""
         sfm, solution = earlier.sfm, earlier.posterior.solution
         row = _rows(model.point_id, self.later)
         other = _rows(sfm.point_id, self.earlier)
         known = (row >= 0) & (other >= 0)
         row, other = row[known], other[known]
+        nothing = self._at(np.zeros(0, dtype=np.int64))
         if len(row) < 3:
-            return None
+            return nothing
         in_geo = solution.similarity.apply(solution.point_in_model(sfm))
         try:
             similarity, near = common_similarity(model.point_in_local[row], in_geo[other], np.random.default_rng(0))
         except DegenerateGeometryError:
-            return None
+            return nothing
+        if near.mean() < _LEAST_SHARE:
+            return nothing
         ties = self._at(np.flatnonzero(known)[near])
         place, ground = in_geo[other[near]], (in_geo, similarity.apply(model.point_in_local))
         length = np.bincount(sfm.obs_point, minlength=len(sfm.point_id))[other[near]]
@@ -294,28 +320,116 @@ class _BothDates:
     first: int  # added to COLMAP's ids of the earlier images
     later: Any  # pycolmap.Reconstruction
     earlier: Any
-    earlier_ids: IntArray  # of the earlier cameras, in their order
+    date: SolvedDate  # the earlier one
+    added: dict[int, FloatArray]  # places (n, 2) of the learned features of images that have some, by their numbers
     known: dict[int, IntArray] = field(default_factory=dict)  # points of the features of images
 
-    def matched(self, colmap: ModuleType, job: SfmJob, pairs: list[tuple[int, int]], progress: Progress) -> _Ties:
-        """Match pairs (later image id, index of an earlier camera), and return the tracks that they tie."""
+    def rounds(self, colmap: ModuleType, job: SfmJob, progress: Progress) -> Iterator[tuple[str, _Ties]]:
+        """Yield the tracks that are tied by SIFT, by SIFT with looser tests, and by learned features beside it."""
+        pairs = self._pairs(job, _NEIGHBOURS)
+        self._match(colmap, job, pairs, progress, loosely=False)
+        yield "SIFT", self._ties(colmap, pairs)
+        more = self._pairs(job, 2 * _NEIGHBOURS)
+        with colmap.Database.open(self.path) as database:  # COLMAP matches no pair twice
+            database.clear_matches()
+            database.clear_two_view_geometries()
+        self._match(colmap, job, more, progress, loosely=True)
+        yield "SIFT, loosely", self._ties(colmap, more)
+        if self._match_learned(colmap, job, pairs, progress):
+            yield "learned features", self._ties(colmap, more)
+
+    def _pairs(self, job: SfmJob, neighbours: int) -> list[tuple[int, int]]:
+        """Return the pairs that may show the same place, by the numbers of their images."""
+        ids = self.date.sfm.image_id
+        found = pairs_across(job.survey, self.later, self.date, neighbours)
+        return [(a, self.first + int(ids[b])) for a, b in found]
+
+    def _match(
+        self, colmap: ModuleType, job: SfmJob, pairs: list[tuple[int, int]], progress: Progress, *, loosely: bool
+    ) -> None:
         matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
         matching.num_threads = chosen_threads(job.options.threads)
-        pairing.match_list_path = self.path.with_name("pairs_across.txt")
-        ids = [(a, self.first + int(self.earlier_ids[b])) for a, b in pairs]
-        with progress.task("matching across the dates", len(ids)) as task:
-            for step in steps(ids, _PAIRS_PER_STEP):
-                lines = (f"{a:09d} {b:09d}\n" for a, b in step)
-                pairing.match_list_path.write_text("".join(lines), encoding="utf-8")
-                colmap.match_image_pairs(self.path, matching, pairing, verification(colmap, job))
+        if loosely:
+            matching.sift.max_ratio, matching.guided_matching = _LOOSE_RATIO, True
+
+        def match(listing: Path) -> None:
+            pairing.match_list_path = listing
+            colmap.match_image_pairs(self.path, matching, pairing, verification(colmap, job))
+
+        self._by_steps(pairs, match, "matching across the dates", progress)
+
+    def _by_steps(
+        self, pairs: list[tuple[int, int]], work: Callable[[Path], None], name: str, progress: Progress
+    ) -> None:
+        """Give lists of some pairs each, which are files, to a function of COLMAP."""
+        listing = self.path.with_name("pairs_across.txt")
+        with progress.task(name, len(pairs)) as task:
+            for step in steps(pairs, _PAIRS_PER_STEP):
+                listing.write_text("".join(f"{a:09d} {b:09d}\n" for a, b in step), encoding="utf-8")
+                work(listing)
                 task.advance(len(step))
-        pairing.match_list_path.unlink(missing_ok=True)
+        listing.unlink(missing_ok=True)
+
+    def _match_learned(
+        self, colmap: ModuleType, job: SfmJob, pairs: list[tuple[int, int]], progress: Progress
+    ) -> bool:
+        """Add matches of the learned features that both dates have; whether there are any.
+
+        Their descriptors are kept nowhere: the photographs are read again, and a feature is known by its place.
+        """
+        photographs = self._photographs(job)
+        usable = self.added.keys() & photographs.keys()
+        wanted = [pair for pair in pairs if usable.issuperset(pair)]
+        if not wanted or missing_for_learned() is not None:
+            return False
+        from pipelines.sfm.learned_features import LearnedMatcher  # and torch
+
+        matcher = LearnedMatcher(job.options.threads)
+        numbers = sorted({number for pair in wanted for number in pair})
+        features, rows = {}, {}
+        with progress.task("learned features", len(numbers)) as task:
+            for number in numbers:
+                found = features[number] = matcher.features(*photographs[number])
+                apart, row = cKDTree(self.added[number]).query(found.in_photograph_px())
+                rows[number] = np.where(apart < _SAME_PX, row, -1)
+                task.advance()
+        matches = {}
+        with progress.task("learned matches", len(wanted)) as task:
+            for a, b in wanted:
+                one, two = matcher.matches(features[a], features[b]).T
+                both = np.column_stack([rows[a][one], rows[b][two]])
+                both = both[(both >= 0).all(axis=1)]
+                if len(both):
+                    matches[a - 1, b - 1] = both
+                task.advance()
+        add_features(colmap, self.path, {number - 1: self.added[number] for number in numbers}, matches)
+
+        def verify(listing: Path) -> None:
+            colmap.verify_matches(self.path, listing, verification(colmap, job))
+
+        self._by_steps([(a + 1, b + 1) for a, b in matches], verify, "verification", progress)
+        return bool(matches)
+
+    def _photographs(self, job: SfmJob) -> dict[int, tuple[SfmJob, SurveyImage]]:
+        """Return the registered photographs of both dates, and where each lies, by their numbers."""
+        home, survey = self.date.workspace, self.date.survey
+        folder, masks = photograph_folder(home, survey.image_dir), masks_beside(str(home.path(SURVEY)), survey)
+        there = SfmJob(survey, folder, home.path(DATABASE), job.options, masks)
+        found = {}
+        for first, model, date in ((0, self.later, job), (self.first, self.earlier, there)):
+            image = {each.name: each for each in date.survey.images}
+            known = {number: model.images[number].name for number in model.reg_image_ids()}
+            found |= {first + number: (date, image[name]) for number, name in known.items() if name in image}
+        return found
+
+    def _ties(self, colmap: ModuleType, pairs: list[tuple[int, int]]) -> _Ties:
+        """Return the tracks that the verified matches of some pairs tie."""
         votes: Counter[tuple[int, int]] = Counter()
         with colmap.Database.open(self.path) as database:
-            found = [self._tied(database, a, b) for a, b in ids if database.exists_two_view_geometry(a, b)]
+            found = [self._tied(database, a, b) for a, b in pairs if database.exists_two_view_geometry(a, b)]
         for of_pair, _ in found:
             votes.update(of_pair)
-        return _one_to_one(votes, sum(matches for _, matches in found))
+        return _one_to_one(votes, sum(matches for _, matches in found), len(pairs))
 
     def _tied(self, database: ColmapDatabase, a: int, b: int) -> tuple[set[tuple[int, int]], int]:
         """Return the pairs of points (later, earlier) that two images tie, and their number of verified matches."""
@@ -341,7 +455,7 @@ def _points_of(image: Any) -> IntArray:
     return np.array([point.point3D_id if point.has_point3D() else -1 for point in image.points2D], dtype=np.int64)
 
 
-def _one_to_one(votes: Counter[tuple[int, int]], matches: int) -> _Ties:
+def _one_to_one(votes: Counter[tuple[int, int]], matches: int, pairs: int) -> _Ties:
     """Return the pairs of tracks that each other's votes prefer."""
     best: tuple[dict[int, tuple[int, int]], dict[int, tuple[int, int]]] = ({}, {})
     for pair, count in sorted(votes.items()):
@@ -350,7 +464,7 @@ def _one_to_one(votes: Counter[tuple[int, int]], matches: int) -> _Ties:
                 best[side][key] = (count, pair[1 - side])
     kept = [(*pair, count) for pair, count in sorted(votes.items()) if _is_best(pair, best)]
     table = np.array(kept, dtype=np.int64).reshape(-1, 3)
-    return _Ties(table[:, 0], table[:, 1], table[:, 2], matches)
+    return _Ties(table[:, 0], table[:, 1], table[:, 2], matches, pairs)
 
 
 def _is_best(pair: tuple[int, int], best: tuple[dict[int, tuple[int, int]], ...]) -> bool:
@@ -377,15 +491,26 @@ def _both_dates(
             copy_rows(earlier.workspace.path(DATABASE), path, FEATURES, [i - 1 for i in ids[1]], shift=first)
         except DamagedPartialError as error:
             raise InputError("earlier-features", str(error), field="--earlier") from error
+        added = _added_features(colmap, path)
         drop_added_features(path)
-        yield _BothDates(path, first, model, other, earlier.sfm.image_id)
+        yield _BothDates(path, first, model, other, earlier, added)
     finally:
         remove_database(path)
 
 
-def _write_images(
-    colmap: ModuleType, database: ColmapDatabase, model: Reconstruction, first: int, cameras: int
-) -> None:
+def _added_features(colmap: ModuleType, path: Path) -> dict[int, FloatArray]:
+    """Return the places (n, 2) of features without SIFT's descriptors, by the numbers of images that have some."""
+    found = {}
+    with colmap.Database.open(path) as database:
+        for image in database.read_all_images():
+            number = image.image_id
+            sift = database.num_descriptors_for_image(number)
+            if database.num_keypoints_for_image(number) > sift:
+                found[number] = np.asarray(database.read_keypoints(number), dtype=np.float64)[sift:, :2]
+    return found
+
+
+def _write_images(colmap: ModuleType, database: Any, model: Any, first: int, cameras: int) -> None:
     """Write the solved cameras and the registered images of a model, their ids moved, into a database."""
     for camera in model.cameras.values():
         moved = colmap.Camera(

@@ -3,6 +3,7 @@
 What cannot be read is not drawn: the commands that write it say what is wrong.
 """
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -81,17 +82,22 @@ def drawn_contours(workspace: Workspace, survey: Survey, frame: ViewFrame) -> li
 
 
 def changed_regions(workspace: Workspace, survey: Survey, frame: ViewFrame) -> list[Json]:
-    """Return the regions that `georef change` found, on the surface; none: there are none."""
+    """Return the regions that `georef change` found, doubtful ones last, on the surface; none: there are none."""
     path, surface = workspace.root / _REGIONS, workspace.root / _SURFACE
     if not path.is_file() or not surface.is_file():
         return []
+    drawn = (_drawn_regions(path, surface, survey, frame, doubtful=doubtful) for doubtful in (False, True))
+    return [region for layer in drawn for region in layer]
+
+
+def _drawn_regions(path: Path, surface: Path, survey: Survey, frame: ViewFrame, *, doubtful: bool) -> list[Json]:
     found: list[Json] = []
     places = 0
     try:
-        wkt, polygons, rows = read_regions(path, ("name", "net_m3", "sigma_m3"))
+        wkt, polygons, rows = read_regions(path, ("name", "net_m3", "sigma_m3"), doubtful=doubtful)
         crs = _crs(wkt, survey, frame)
         for polygon, (name, net_m3, sigma_m3) in zip(polygons, rows, strict=True):
-            text = f"{name}: {net_m3:+.1f} ± {sigma_m3:.1f} m³"
+            text = f"{name}: {net_m3:+.1f} ± {sigma_m3:.1f} m³{', doubtful' if doubtful else ''}"
             for part in shapely.get_parts(polygon):
                 xy = np.array(part.exterior.coords)
                 places += len(xy)
@@ -102,7 +108,8 @@ def changed_regions(workspace: Workspace, survey: Survey, frame: ViewFrame) -> l
                     continue
                 height = np.where(np.isfinite(height), height, np.nanmedian(height))
                 at = frame.from_geo(crs.geo_from_xyz(np.column_stack([xy, height])))
-                found.append({"text": text, "raised": net_m3 > 0, "at": np.round(at, 2).tolist()})
+                outline = {"at": np.round(at, 2).tolist(), "raised": net_m3 > 0, "doubtful": doubtful}
+                found.append({"text": text, **outline})
                 text = ""
     except GeorefError:
         return []

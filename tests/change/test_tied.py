@@ -16,13 +16,17 @@ from pipelines.change.options import ChangeOptions
 from pipelines.change.stage import run
 from pipelines.change.tied import Contradicted, Surfaces, Tied, contradicted, tied_by
 from pipelines.core.products import load_json, save_json
-from pipelines.core.stages import COMMON_POINTS, MODEL
+from pipelines.core.stages import COMMON_POINTS, MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.geotiff import read_cells
 from pipelines.geodesy.crs import parse_crs
+from pipelines.survey.calibrated import load_survey
 from pipelines.survey.change_report import Change, ChangedRegion
 from pipelines.survey.common_points import CommonPoints
-from pipelines.survey.solution import TrainedModel
+from pipelines.survey.solution import TrainedModel, read_sfm, read_solution
+from pipelines.survey.survey import Survey
+from pipelines.view.overlays import changed_regions
+from pipelines.view.pictures import frame_of
 from tests.change_pairs import TownPair, tie, town_pair
 from tests.refusals import refused
 from tests.trained_workspaces import trained_workspace
@@ -84,6 +88,35 @@ def test_tied_epochs_need_no_registration(pair: TownPair, tmp_path: Path) -> Non
     assert sum(place["properties"]["used"] for place in places) == change.common.used
     assert "<circle" in (tmp_path / "out/change.html").read_text("utf-8")
     assert summary.values["common"] == change.common.model_dump()
+
+
+def test_two_flights_of_one_day_show_no_change(tmp_path: Path) -> None:
+    made = town_pair(tmp_path, changed=False)
+    tie(made.workspaces[1], made.workspaces[0])
+    change, summary = compared(*made.workspaces, tmp_path / "out")
+    assert change.common is not None
+    assert change.regions == ()
+    assert not summary.warnings
+    assert change.significant_share <= 0.01
+
+
+@pytest.mark.parametrize(("twice", "code"), [(2, "photographs-in-both"), (None, "same-photographs")])
+def test_one_flight_trained_twice_is_no_second_date(tmp_path: Path, twice: int | None, code: str) -> None:
+    """The surfaces differ by noise, as those of two trainings do; the photographs are the same, all or two."""
+    made = town_pair(tmp_path, changed=False)
+    for workspace, of in zip(made.workspaces, "ab", strict=True):
+        survey = load_json(Survey, workspace.path(SURVEY))
+        images = [
+            image.model_copy(update={"sha256": f"{index}" if twice is None or index < twice else f"{of}{index}"})
+            for index, image in enumerate(survey.images)
+        ]
+        save_json(survey.model_copy(update={"images": tuple(images)}), workspace.root / SURVEY)
+    if twice is None:
+        with refused(code):
+            compared(*made.workspaces, tmp_path / "out")
+        return
+    (told,) = [one for one in compared(*made.workspaces, tmp_path / "out")[1].warnings if one.code == code]
+    assert told.sentence.startswith("2 photographs")
 
 
 def region_of(name: str, net_m3: float, area_m2: float = 100.0) -> ChangedRegion:
@@ -169,7 +202,14 @@ def test_a_doubtful_region_is_no_change(pair: TownPair, tmp_path: Path, monkeypa
     for name, names in (("doubtful", ["D1"]), ("regions", ["R1", "R2", "R3"])):
         features = json.loads((tmp_path / f"out/{name}.geojson").read_text("utf-8"))["features"]
         assert [one["properties"]["name"] for one in features] == names
-    assert 'id="region-D1"' in (tmp_path / "out/change.html").read_text("utf-8")
+    (tmp_path / "out").rename(after.root / "change")
+    frame = frame_of(solution := read_solution(after), read_sfm(after, solution))
+    drawn = {
+        one["text"].partition(":")[0]: one["doubtful"] for one in changed_regions(after, load_survey(after), frame)
+    }
+    assert drawn == {"R1": False, "R2": False, "R3": False, "D1": True}
+    out = after.root / "change"
+    assert 'id="region-D1"' in (out / "change.html").read_text("utf-8")
 
 
 def test_points_of_another_sfm_are_stale(pair: TownPair, tmp_path: Path) -> None:

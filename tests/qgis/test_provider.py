@@ -76,7 +76,7 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write(workspace / "change/significant.tif", (1 + 2.99 * ramp).astype(np.uint8)[None])
     shapes = [shapely.box(EAST + at, NORTH - 4, EAST + at + 3, NORTH) for at in (0, 5)]
     rows = [{"name": name, "net_m3": volume} for name, volume in (("R1", -12.0), ("R2", 7.5))]
-    write_polygons_gpkg(workspace / "change/regions.gpkg", "regions", shapes, rows, WKT)
+    write_polygons_gpkg(workspace / "change/regions.gpkg", {"regions": (shapes, rows)}, WKT)
     return workspace
 
 

@@ -172,9 +172,11 @@ function drawOverlays(context, pixelOf) {
   context.lineWidth = 1.5;
   if (on("boundary")) { context.strokeStyle = css("--chosen"); for (const ring of scene.boundary) line(context, pixelOf, ring); }
   if (on("contours")) for (const { at, major } of scene.contours) { context.strokeStyle = css("--ink"); context.lineWidth = major ? 1.6 : 0.7; line(context, pixelOf, at); }
-  if (on("changes")) for (const { at, text, raised } of scene.changes) {
+  if (on("changes")) for (const { at, text, raised, doubtful } of scene.changes) {
     context.strokeStyle = css(raised ? "--main" : "--alarm"); context.lineWidth = 2;
+    context.setLineDash(doubtful ? [6, 4] : []);
     line(context, pixelOf, at);
+    context.setLineDash([]);
     const pixel = text && pixelOf(at[0]);
     if (pixel) label(context, text, pixel.x + 6, pixel.y - 4, css(raised ? "--main" : "--alarm"));
   }
