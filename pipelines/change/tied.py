@@ -241,8 +241,8 @@ def _is_older(earlier: Workspace, later: Workspace) -> bool:
 
 def _solved_again(earlier: Workspace, later: Workspace) -> Remark:
     sentence = (
-        f"{later.root.name} was tied to an older solution of {earlier.root.name}, which was solved or trained "
-        f"again since: the points in common do not count."
+        f"{later.root.name} was tied to an older solution of {earlier.root.name}, which has put its cameras "
+        "elsewhere since: the points in common do not count."
     )
     remedy = f"`georef run {later.root}` ties it again."
     return Remark(code="earlier-solved-again", sentence=sentence, remedy=remedy)

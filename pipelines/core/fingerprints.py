@@ -71,7 +71,9 @@ def fingerprints(
             flag = flag_name(type(options), name)
             if not path.exists():
                 raise InputError("no-such-file", "does not exist.", path=path, field=flag)
-            if path.is_dir():
+            if markers[name].first:
+                result.hashes[flag] = first_hash(Workspace(path), markers[name].first, memo)
+            elif path.is_dir():
                 files = _input_files(path, workspace.root, markers[name])
                 records = _records(files, (known or {}).get(flag, {}), progress)
                 result.files[flag] = records
@@ -84,6 +86,12 @@ def fingerprints(
     except OSError as error:
         raise InputError("file-unreadable", f"cannot be read: {error.strerror}.", path=error.filename) from error
     return result
+
+
+def first_hash(workspace: Workspace, parts: Sequence[ProductPart], memo: Memo) -> str:
+    """Return the hash of the first of some parts that a workspace has; empty: none."""
+    part = next((part for part in parts if workspace.has(part.product)), None)
+    return "" if part is None else hashes_of(workspace, part, memo).get(part.product, "")
 
 
 def hashes_of(workspace: Workspace, part: ProductPart, memo: Memo) -> dict[str, str]:

@@ -25,6 +25,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.extras import Extra, require
 from pipelines.core.files import file_size, replace_text
 from pipelines.core.sentences import fault_sentence
+from pipelines.core.stages import ProductPart
 from pipelines.core.types import Vector3
 from pipelines.core.validators import require_text
 
@@ -40,12 +41,13 @@ class InputMarker:
     """Mark of a path whose content decides the stage's result: its fingerprint enters the manifest.
 
     In a folder, files with the suffixes, in lower case, count; without any, all do. With `only`, the files at these
-    places in the folder count, as far as there are any. Files `beside` a file count with it: by its suffix, in
-    lower case, patterns in its folder.
+    places in the folder count, as far as there are any; with `first`, of a workspace, the first of these products
+    that it has. Files `beside` a file count with it: by its suffix, in lower case, patterns in its folder.
     """
 
     suffixes: frozenset[str] = frozenset()
     only: frozenset[str] = frozenset()
+    first: tuple[ProductPart, ...] = ()
     beside: tuple[tuple[str, tuple[str, ...]], ...] = ()
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from pipelines.core.options import EFFORT, InputMarker, StageOptions
-from pipelines.core.stages import ADJUSTMENT, MODEL, SPARSE
+from pipelines.core.stages import SOLVED_PLACES
 
 _DOUBLED_BELOW_PX = 1000
 _SOLVED = frozenset({".bin", ".txt", ".json", ".geojson", ".opf", ".gltf", ".xml", ".csv"})
@@ -15,8 +15,6 @@ _BESIDE = (
     (".json", ("tracks.csv",)),
     (".geojson", ("cameras.json", "../cameras.json")),
 )
-# What this date takes from an earlier one: a new solution there asks for new ties.
-_SOLUTION = frozenset({SPARSE, ADJUSTMENT, MODEL})
 SolvedCamerasPath = Annotated[Path, InputMarker(_SOLVED, beside=_BESIDE)]
 
 
@@ -67,7 +65,7 @@ class SfmOptions(StageOptions):
         "nerfstudio's transforms.json, or RealityScan's CSV. Points are triangulated where the file has none.",
         json_schema_extra={"flag": "--import"},
     )
-    earlier: Annotated[Path, InputMarker(only=_SOLUTION)] | None = Field(
+    earlier: Annotated[Path, InputMarker(first=SOLVED_PLACES)] | None = Field(
         None,
         description="Workspace of an earlier date, solved: tie this one to it by points in common, so that "
         "`georef change` needs no registration. It is only read.",

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from hashlib import sha256
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
+from pipelines.core.fingerprints import first_hash
 from pipelines.core.products import ArrayProduct, save_npz
-from pipelines.core.stages import ADJUSTMENT, MODEL
+from pipelines.core.stages import SOLVED_PLACES
 from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import Origin, ecef_from_enu_rotation, enu_from_ecef, lla_of
@@ -116,5 +116,8 @@ class CommonPoints(ArrayProduct):
 
 
 def solution_hash(workspace: Workspace) -> str:
-    """Return the SHA-256 of the solution of a workspace, that of its training if there is one."""
-    return sha256(workspace.path(MODEL if workspace.has(MODEL) else ADJUSTMENT).read_bytes()).hexdigest()
+    """Return the hash of where the solution of a workspace, that of its training if there is one, puts things.
+
+    A training that keeps the cameras has the hash of what it keeps: it may follow `sfm` of the later date.
+    """
+    return first_hash(workspace, SOLVED_PLACES, {})
