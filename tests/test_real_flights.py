@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,11 +16,12 @@ from tests.scripts import REPOSITORY, load_script
 
 real_flights = load_script(REPOSITORY / "examples/flights/real_flights.py")
 
-RUN = real_flights.Run(peak_mb=2345.0, error="", at="2026-11-27", version="0.1.0")
+RUN = real_flights.Run(peak_mb=2345.0, error="", at="2026-11-27", version="0.1.0", hardware="a machine")
+NOTHING = real_flights.Published({}, {}, "")
 
 
-def _flight(name: str, **values: str) -> object:
-    return real_flights.Flight(name, "A flight", "https://github.com/a/b", "flight", "a trap", **values)
+def _flight(name: str, title: str = "A flight", **values: str) -> object:
+    return real_flights.Flight(name, title, "https://github.com/a/b", "flight", "a trap", **values)
 
 
 @pytest.mark.slow
@@ -37,14 +39,38 @@ def test_table_and_page_say_what_the_products_say(finished: Workspace, tmp_path:
     assert re.fullmatch(r"\d+ % of \d+\.\d\d ha", cells[6])
 
     arguments = argparse.Namespace(preset="smoke", out=out)
-    failed = real_flights.Run(100.0, "/home/me/photos/a.jpg: is no photograph", "2026-11-27", "0.1.0")
-    page = real_flights.page_of([(flight, RUN), (_flight("gone"), failed)], [_flight("x")], arguments, tmp_path)
+    failed = replace(RUN, error="/home/me/photos/a.jpg: is no photograph")
+    flights, runs = (
+        [flight, _flight("gone", "Another"), _flight("x", "Elsewhere")],
+        {flight.name: RUN, "gone": failed},
+    )
+    page = real_flights.page_of(flights, runs, NOTHING, arguments, tmp_path)
     assert "| [A flight](#a-flight) |" in page and "**Failed**: a.jpg: is no photograph" in page
-    assert re.search(r"\[A flight\]\(#a-flight\) \| – \|.*\| failed \|", page)
+    assert re.search(r"\[Another\]\(#another\) \| – \|.*\| failed \|", page)
+    assert page.count("Run with georef 0.1.0 on a machine, 2026-11-27.") == 2
     assert (tmp_path / f"real_{flight.name}.jpg").stat().st_size > 500
     assert "## Not run" in page and "/home/" not in page
     for code in real_flights.remarks(real_flights.figures_of(finished.root)).values():
         assert f"`{code}`" in page
+
+    again = real_flights.published_in(page)
+    assert set(again.rows) == set(again.sections) == {"A flight", "Another"}
+    assert real_flights.page_of(flights, {}, again, arguments, tmp_path) == page
+
+
+def test_a_page_keeps_the_flights_that_are_not_run_again(tmp_path: Path) -> None:
+    """One flight is run again and fails now; the other has its former row, section, version and day."""
+    flights = [_flight("a", "One"), _flight("b", "Two")]
+    arguments = argparse.Namespace(preset="smoke", out=tmp_path)
+    first = real_flights.page_of(flights, {"a": RUN, "b": RUN}, NOTHING, arguments, tmp_path)
+    shared = "Most of them have the remarks `default-sigma`."
+    first = first.replace("\n\n## One", f"\n\n{shared}\n\n## One")
+    failed = replace(RUN, error="no overlap", at="2026-11-28", version="0.2.0")
+    second = real_flights.page_of(flights, {"b": failed}, real_flights.published_in(first), arguments, tmp_path)
+    assert second.index("| [One]") < second.index("| [Two]") < second.index(shared) < second.index("## One")
+    one, two = second.split("## One")[1].split("## Two")
+    assert one == first.split("## One")[1].split("## Two")[0]
+    assert "**Failed**: no overlap" in two and "Run with georef 0.2.0 on a machine, 2026-11-28." in two
 
 
 def test_a_flight_that_fails_is_recorded_with_its_error(tmp_path: Path) -> None:

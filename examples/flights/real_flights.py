@@ -5,7 +5,8 @@
 
 The photographs are downloaded by you, from the addresses in flights.toml. Each flight is a workspace in OUT, run at
 one preset with its rasters and report; what stands there already is not made again. Its time is the sum of its
-stages' times, its memory that of the run that ended it. A flight that fails has its error in the table.
+stages' times, its memory that of the run that ended it. A flight that fails has its error in the table. A flight
+without a workspace in OUT keeps its row and section of the page, with version, machine and day of its own run.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import sys
 import time
 import tomllib
 from collections import Counter
-from collections.abc import Iterable, Set
+from collections.abc import Set
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -67,6 +68,7 @@ class Run:
     error: str
     at: str
     version: str
+    hardware: str
 
 
 def main() -> None:
@@ -82,20 +84,20 @@ def main() -> None:
         Flight(name, **row) for name, row in tomllib.loads((HERE / "flights.toml").read_text("utf-8")).items()
     ]
     present = [flight for flight in flights if (arguments.data / flight.folder).is_dir()]
-    rows = []
+    runs = {}
     for flight in present:
         if not arguments.only or flight.name in arguments.only:
-            run = run_flight(flight, arguments.data, arguments.out, arguments.preset)
+            runs[flight.name] = run_flight(flight, arguments.data, arguments.out, arguments.preset)
         elif (record := record_of(arguments.out / flight.name)) is not None:
-            run = record
+            runs[flight.name] = record
         else:
             continue
-        rows.append((flight, run))
-        print(row_of(flight, run, arguments.out / flight.name), flush=True)
+        print(row_of(flight, runs[flight.name], arguments.out / flight.name), flush=True)
     if arguments.page is not None:
-        thumbnails = arguments.page / "images"
-        page = page_of(rows, [f for f in flights if f not in present], arguments, thumbnails)
-        (arguments.page / "real_flights.md").write_text(page, encoding="utf-8")
+        path = arguments.page / "real_flights.md"
+        published = published_in(path.read_text("utf-8")) if path.is_file() else Published({}, {}, "")
+        page = page_of(flights, runs, published, arguments, arguments.page / "images")
+        path.write_text(page, encoding="utf-8")
 
 
 def run_flight(flight: Flight, data: Path, out: Path, preset: str) -> Run:
@@ -120,7 +122,7 @@ def run_flight(flight: Flight, data: Path, out: Path, preset: str) -> Run:
     error = (
         "" if os.waitstatus_to_exitcode(status) == 0 else (re.findall(r"(?m)^error: .*", said) or [said[-300:]])[-1]
     )
-    run = Run(usage.ru_maxrss / 1024, error.removeprefix("error: "), started, described_version())
+    run = Run(usage.ru_maxrss / 1024, error.removeprefix("error: "), started, described_version(), hardware())
     if before is not None and not before.error and not run.error and run.peak_mb < before.peak_mb:
         return before  # Little was left to do.
     record_file(workspace).write_text(json.dumps(asdict(run)), encoding="utf-8")
@@ -193,7 +195,10 @@ def minutes(figures: Figures) -> float:
 def registered(figures: Figures) -> str:
     """Return how many photographs of the survey the model has."""
     values = figures.manifests["sfm"].values if "sfm" in figures.manifests else None
-    return f"{values['registered']} of {values['images']}" if values else "–"
+    if not values:
+        return "–"
+    lenses = f", and {values['companions_registered']} of {values['companions']} of the other lenses"
+    return f"{values['registered']} of {values['images']}{lenses if values.get('companions') else ''}"
 
 
 def accuracy(figures: Figures) -> str:
@@ -254,27 +259,51 @@ def common_remarks(flights: list[dict[str, str]]) -> set[str]:
     return {code for code, count in codes.items() if len(flights) > 2 and 2 * count > len(flights)}
 
 
+@dataclass(frozen=True)
+class Published:
+    """What a page says: rows and sections of flights by their titles, and the line of remarks in common."""
+
+    rows: dict[str, str]
+    sections: dict[str, str]
+    shared: str
+
+
+def published_in(page: str) -> Published:
+    """Return what a page says of the flights that it has."""
+    rows = {match[1]: match[0] for match in re.finditer(r"(?m)^\| \[([^\]]+)\]\(#.*$", page)}
+    parts = re.split(r"(?m)^## (.+)$", page)
+    sections = {title: f"## {title}{text}".rstrip() for title, text in zip(parts[1::2], parts[2::2], strict=True)}
+    shared = re.search(r"(?m)^Most of them have the remarks .*$", parts[0])
+    return Published(rows, {title: sections[title] for title in rows}, "" if shared is None else shared[0])
+
+
 def page_of(
-    rows: list[tuple[Flight, Run]], others: list[Flight], arguments: argparse.Namespace, images: Path
+    flights: list[Flight], runs: dict[str, Run], published: Published, arguments: argparse.Namespace, images: Path
 ) -> str:
-    """Return the page: the table, a section for each flight with its picture and remarks, and what was not run."""
-    head = (
-        (HERE / "page.md")
-        .read_text("utf-8")
-        .format(
-            preset=arguments.preset,
-            versions=", ".join(sorted({run.version for _, run in rows})),
-            hardware=hardware(),
-            dates=dates(run for _, run in rows),
-        )
-    )
-    table = [row_of(flight, run, arguments.out / flight.name) for flight, run in rows]
-    common = common_remarks([remarks(figures_of(arguments.out / flight.name)) for flight, _ in rows])
-    shared = [f"Most of them have the remarks {codes_text(Counter(sorted(common)))}.", ""] if common else []
-    sections = [section(flight, run, arguments.out / flight.name, images, common) for flight, run in rows]
-    left = ", ".join(f"[{flight.title}]({flight.source})" for flight in others)
-    unrun = ["## Not run", "", f"{left}.", ""] if others else []
-    return "\n".join([head.rstrip("\n"), *table, "", *shared, *sections, *unrun])
+    """Return the page: the table, a section for each flight with its picture and remarks, and what was not run.
+
+    Flights without a run have what is published of them.
+    """
+    workspace = {flight.name: arguments.out / flight.name for flight in flights}
+    kept = [flight for flight in flights if flight.name not in runs and flight.title in published.rows]
+    if kept:
+        shared, common = published.shared, set(re.findall(r"`([a-z0-9-]+)`", published.shared))
+    else:
+        common = common_remarks([remarks(figures_of(workspace[name])) for name in runs])
+        shared = f"Most of them have the remarks {codes_text(Counter(sorted(common)))}." if common else ""
+    rows, sections, unrun = [], [], []
+    for flight in flights:
+        if (run := runs.get(flight.name)) is not None:
+            rows.append(row_of(flight, run, workspace[flight.name]))
+            sections.append(section(flight, run, workspace[flight.name], images, common))
+        elif flight in kept:
+            rows.append(published.rows[flight.title])
+            sections += [published.sections[flight.title], ""]
+        else:
+            unrun.append(f"[{flight.title}]({flight.source})")
+    head = (HERE / "page.md").read_text("utf-8").format(preset=arguments.preset)
+    parts = [head.rstrip("\n"), *rows, "", *([shared, ""] if shared else []), *sections]
+    return "\n".join([*parts, *(["## Not run", "", f"{', '.join(unrun)}.", ""] if unrun else [])])
 
 
 def section(flight: Flight, run: Run, workspace: Path, images: Path, said: Set[str] = frozenset()) -> str:
@@ -294,7 +323,8 @@ def section(flight: Flight, run: Run, workspace: Path, images: Path, said: Set[s
     if run.error:
         lines += ["", f"**Failed**: {plain(run.error)}"]
     own = Counter(code for code in remarks(figures).values() if code not in said)
-    lines += ["", f"Remarks: {codes_text(own)}.", ""] if own else [""]
+    lines += ["", f"Remarks: {codes_text(own)}."] if own else []
+    lines += ["", f"Run with georef {run.version} on {run.hardware}, {run.at}.", ""]
     return "\n".join(lines)
 
 
@@ -332,12 +362,6 @@ def hardware() -> str:
     info = Path("/proc/cpuinfo")
     names = re.findall(r"model name\s*: (.*)", info.read_text("utf-8")) if info.is_file() else []
     return f"{names[0] if names else platform.processor()}, {os.cpu_count()} cores"
-
-
-def dates(runs: Iterable[Run]) -> str:
-    """Return the days on which the runs were made."""
-    days = sorted({run.at for run in runs})
-    return days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}" if days else "not run"
 
 
 if __name__ == "__main__":
