@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 import pytest
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT
-from pipelines.formats.colmap import pycolmap_module
+from pipelines.formats.colmap import pycolmap_module, quiet_colmap
 from pipelines.geometry.rotations import exp_so3, quat_xyzw_from_matrix
+from pipelines.geometry.similarity import umeyama
 from pipelines.sfm import colmap_reconstruction, learned_weights
 from pipelines.sfm.features import SfmJob
-from pipelines.sfm.learned_features import LearnedFeatures, LearnedMatcher, quarters_to_north
+from pipelines.sfm.learned_features import LearnedFeatures, quarters_to_north
 from pipelines.sfm.rounds import MappedModels
-from pipelines.survey.survey import Attitude, SurveyImage
+from pipelines.sfm.unregistered import unregistered
+from pipelines.survey.survey import Attitude, Survey, SurveyImage
 from tests.refusals import refused
-from tests.sfm_scenes import CONFIG, Photographs, survey_of
+from tests.seasons import photographed_in_two_seasons
+from tests.sfm_scenes import CONFIG, FLIGHT, survey_of
 
 NADIR = np.diag([1.0, -1.0, -1.0])  # geo from cam: the picture's top looks north
 
@@ -133,16 +135,6 @@ def test_weights_are_unpacked_and_checked(cache: Path, tmp_path: Path, monkeypat
         learned_weights.weights_file("aliked-n16rot.pth")
 
 
-def winter(summer: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The same place under thin snow with drifts, in light from elsewhere and of another colour."""
-    height, width = summer.shape[:2]
-    drifts = cv2.GaussianBlur(rng.random((height, width)), (0, 0), 3.0)
-    drifts = (drifts - drifts.mean()) / drifts.std()
-    light = np.linspace(0.7, 1.2, height)[:, None, None] * [1.1, 1.0, 0.85]
-    seen = (0.4 + 0.4 * summer / 255.0 + 0.04 * drifts[:, :, None]) * light
-    return np.asarray(np.clip(255.0 * seen + rng.normal(0, 5, summer.shape), 0, 255).astype(np.uint8))
-
-
 def job_of(folder: Path, names: list[str]) -> SfmJob:
     return SfmJob(survey_of(names), folder, folder / "database.db", CONFIG)
 
@@ -161,36 +153,55 @@ def test_photographs_without_matches_are_told_of_learned_features(
     assert any(remedy in str(caught.value) for remedy in remedies)
 
 
+@dataclass(frozen=True)
+class TwoSeasons:
+    """Photographs of one flight, every second of which shows the winter."""
+
+    folder: Path
+    survey: Survey
+    center_in_geo: dict[str, np.ndarray]
+
+    def job(self, folder: Path) -> SfmJob:
+        return SfmJob(self.survey, self.folder, folder / "database.db", CONFIG)
+
+
+@pytest.fixture(scope="module")
+def seasons(tmp_path_factory: pytest.TempPathFactory) -> TwoSeasons:
+    """From 60 m, where a pixel is 0.2 m; each photograph overlaps with some of both seasons."""
+    pytest.importorskip("embreex")
+    folder = tmp_path_factory.mktemp("seasons") / "photos"
+    options = FLIGHT.model_copy(update={"images": 10, "size": "360x270"})
+    return TwoSeasons(folder, *photographed_in_two_seasons(options, folder))
+
+
 @pytest.mark.slow
-def test_another_season_is_matched_where_sift_finds_nothing(photographs: Photographs, tmp_path: Path) -> None:
-    """SIFT's matches of the two seasons fit no geometry; those of the learned features are those of one place."""
+@pytest.mark.usefixtures("one_thread")
+def test_without_learned_features_one_season_stays_out(seasons: TwoSeasons, cache: Path, tmp_path: Path) -> None:
+    """SIFT matches no pair across the seasons, and what would connect them is said."""
+    job = seasons.job(tmp_path)
+    with quiet_colmap() as colmap:
+        model, _ = colmap_reconstruction.reconstruct(colmap, job, SILENT)
+        (remark,) = unregistered(colmap, job.database, model, learned_weights.learned_remedy("auto"))
+    registered = {model.images[key].name for key in model.reg_image_ids()}
+    assert len(registered) < 0.6 * len(seasons.survey.images)
+    assert len({name.partition("_")[0] for name in registered}) == 1
+    assert not cache.exists()
+    assert any(remedy in remark.remedy for remedy in (learned_weights.FETCH, "georefgs[learned]"))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_thread")
+def test_learned_features_connect_two_seasons(seasons: TwoSeasons, tmp_path: Path) -> None:
+    """At least 95 % are in one model; what SIFT connects within a season, they connect across the two."""
     if (missing := learned_weights.missing_for_learned()) is not None:
         pytest.skip(missing)
-    first, second = photographs.names[:2]
-    summer = cv2.imread(str(photographs.folder / first))
-    other = winter(cv2.imread(str(photographs.folder / second)), np.random.default_rng(0))
-    for name, pixels in ((first, summer), (second, other)):
-        cv2.imwrite(str(tmp_path / f"{name}.png"), pixels)
-    job, matcher = job_of(tmp_path, [f"{first}.png", f"{second}.png"]), LearnedMatcher(2)
-    found = [matcher.features(job, image) for image in job.survey.images]
-    rows = matcher.matches(*found)
-    learned = [each.in_photograph_px()[rows[:, side]] for side, each in enumerate(found)]
-
-    sift = cv2.SIFT_create(1000)
-    (at, described), (there, compared) = (sift.detectAndCompute(pixels, None) for pixels in (summer, other))
-    pairs = cv2.BFMatcher().knnMatch(described, compared, k=2)
-    near = [one for one, next_one in pairs if one.distance < 0.8 * next_one.distance]
-    by_sift = [
-        np.array([at[one.queryIdx].pt for one in near]).reshape(-1, 2),
-        np.array([there[one.trainIdx].pt for one in near]).reshape(-1, 2),
-    ]
-    assert agreeing(by_sift) < 15  # as many as COLMAP asks for
-    assert agreeing(learned) > 50
-
-
-def agreeing(places: list[np.ndarray]) -> int:
-    """Number of matches that fit one epipolar geometry within 1.5 px."""
-    if len(places[0]) < 8:
-        return 0
-    _, inlier = cv2.findFundamentalMat(*places, cv2.FM_RANSAC, 1.5, 0.999)
-    return 0 if inlier is None else int(inlier.sum())
+    with quiet_colmap() as colmap:
+        model, _ = colmap_reconstruction.reconstruct(colmap, seasons.job(tmp_path), SILENT)
+    assert model.num_reg_images() >= 0.95 * len(seasons.survey.images)
+    images = [model.images[key] for key in model.reg_image_ids()]
+    solved = np.array([image.projection_center() for image in images])
+    true = np.array([seasons.center_in_geo[image.name] for image in images])
+    error_m = np.linalg.norm(umeyama(solved, true).apply(solved) - true, axis=1)
+    print(error_m)
+    # A pixel is 0.2 m; a photograph that wrong matches connect would be metres away.
+    assert error_m.max() < 0.5
