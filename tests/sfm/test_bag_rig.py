@@ -97,7 +97,7 @@ def info(flight: Circle, lens: BrownLens, topic: str, frame: str) -> Message:
 
 
 def test_the_cameras_of_a_bag_keep_their_places_at_each_instant(tmp_path: Path) -> None:
-    """From 42 m a pixel is 12 cm; the offset of the cameras comes from all instants."""
+    """From 42 m a pixel is 12 cm; some 800 places in a photograph tell its centre to a hundredth of that."""
     flight, workspace = Circle(), Workspace(tmp_path / "ws")
     messages, center = recorded(flight)
     bag = bags.write(tmp_path / "bag", messages)
@@ -119,10 +119,10 @@ def test_the_cameras_of_a_bag_keep_their_places_at_each_instant(tmp_path: Path) 
         solved[place[name]], rotation[place[name]] = -turn.T @ shift, turn
     world = umeyama(solved[:, 0], center[:, 0])
     placed = world.apply(solved.reshape(-1, 3)).reshape(solved.shape)
-    error_m = np.linalg.norm((placed - placed[:, :1]) - (center - center[:, :1]), axis=2)[:, 1]
-    print(error_m.max(), np.linalg.norm(placed - center, axis=2).max())
+    error_m = np.linalg.norm(placed - center, axis=2)
+    print(error_m.max(axis=0))
     assert error_m.max() < 0.02
-    # A pixel is 0.17°, and the offset of two centres is one pose for all instants.
+    # A pixel is 0.17°; all instants have one rotation of the cameras against each other.
     apart = log_so3(rotation[:, 1] @ np.swapaxes(rotation[:, 0], 1, 2) @ TURN.T)
     assert np.degrees(np.linalg.norm(apart, axis=1)).max() < 0.05
     assert np.ptp(apart, axis=0).max() < 1e-9
