@@ -122,7 +122,14 @@ SOLVED = (
 )
 
 # Where a solution has put cameras and points; a training that keeps the cameras keeps all of it.
-_PLACES = ("geo_from_model", "model_from_local", "cameras.name", "cameras.quat_xyzw", "cameras.translation", "lenses")
+_PLACES = (
+    "geo_from_model",
+    "model_from_local",
+    "cameras.name",
+    "cameras.quat_xyzw",
+    "cameras.translation",
+    "lenses",
+)
 SOLVED_PLACES = ProductPart(MODEL, fields=_PLACES, optional=True), ProductPart(ADJUSTMENT, fields=_PLACES)
 
 # The area of interest, to which splats are cropped on request.

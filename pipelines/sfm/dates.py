@@ -415,7 +415,7 @@ class _BothDates:
         home, survey = self.date.workspace, self.date.survey
         folder, masks = photograph_folder(home, survey.image_dir), masks_beside(str(home.path(SURVEY)), survey)
         there = SfmJob(survey, folder, home.path(DATABASE), job.options, masks)
-        found = {}
+        found: dict[int, tuple[SfmJob, SurveyImage]] = {}
         for first, model, date in ((0, self.later, job), (self.first, self.earlier, there)):
             image = {each.name: each for each in date.survey.images}
             known = {number: model.images[number].name for number in model.reg_image_ids()}
