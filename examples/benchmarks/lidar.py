@@ -237,7 +237,8 @@ def comparison(
         found = compared.registration.shift_m
         off = []
         for axis in 0.1 * np.eye(3):
-            again = registration_of(compared.cloud.moved(axis), compared.surface_in_model, compared.views, options.seed)
+            moved = compared.cloud.moved(axis)
+            again = registration_of(moved, compared.surface_in_model, compared.views, options.seed)
             off.append(np.abs(again.shift_m - found - axis).max())
         return {"shift error": round(float(np.abs(found).max()), 4), "of 0.1 m": round(float(max(off)), 4)}
     judged = lidar_surface(compared, files, survey, options, None)
