@@ -24,8 +24,8 @@ from pydantic.fields import FieldInfo
 from pipelines.core.errors import InputError
 from pipelines.core.extras import Extra, require
 from pipelines.core.files import file_size, replace_text
+from pipelines.core.product_parts import ProductPart
 from pipelines.core.sentences import fault_sentence
-from pipelines.core.stages import ProductPart
 from pipelines.core.types import Vector3
 from pipelines.core.validators import require_text
 

@@ -17,6 +17,7 @@ from pipelines.core.fingerprints import Fingerprints, fingerprints, hashes_of
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo
 from pipelines.core.options import StageOptions, as_flags, decisive_fields, load_toml, read_requests, resolve
+from pipelines.core.product_parts import whole_products
 from pipelines.core.products import Remark, union
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import (
@@ -29,7 +30,6 @@ from pipelines.core.stages import (
     StageSpec,
     producer_of,
     products_of,
-    whole_products,
 )
 from pipelines.core.validators import require_text
 from pipelines.core.workspace import Workspace

@@ -11,7 +11,8 @@ import pytest
 from pipelines.core.errors import MissingProductError
 from pipelines.core.fingerprints import fingerprints
 from pipelines.core.options import StageOptions
-from pipelines.core.stages import APPLIED_RIG, MEASURED, PHOTOGRAPHS, RIG, SURVEY, TRACK, ProductPart, StageSpec
+from pipelines.core.product_parts import ProductPart
+from pipelines.core.stages import APPLIED_RIG, MEASURED, PHOTOGRAPHS, RIG, SURVEY, TRACK, StageSpec
 from pipelines.core.workspace import Workspace
 
 FIX = {"position_in_geo": [1.0, 2.0, 3.0], "cov_in_geo": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
