@@ -156,6 +156,17 @@ def test_adjustment_solves_the_mount_that_a_survey_leaves_unknown(seed: int) -> 
     assert without.initial.residuals["gnss"].rmse_3d_m > found.initial.residuals["gnss"].rmse_3d_m
 
 
+def test_downward_lever_arm_of_a_level_flight_widens_the_height() -> None:
+    """Nothing tells it from another height of the whole: its prior of 1 m is all that is known of either."""
+    survey, model, points = material(Noise(), Measured(), layout="grid")
+    survey = survey.model_copy(update={"estimate": ("lever-arm",)})
+    found, _ = estimated(survey, model, points, CONFIG)
+    assert squared_error(found) < 24.3  # χ²₇ at 0.999
+    (arm,) = (error for error in found.estimated_errors if error.name == "lever-arm")
+    assert not arm.observed[2] and arm.sigma[2] > 0.5
+    assert np.sqrt(np.array(found.initial.geo_from_local.covariance)[6, 6]) > 0.5
+
+
 def test_control_points_alone_carry_the_survey() -> None:
     survey, model, points = material(Noise(), Measured(fixes=False, attitudes=False, gcps=True))
     found, _ = estimated(survey, model, points, CONFIG)
