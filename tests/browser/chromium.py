@@ -235,7 +235,7 @@ class Viewer:
         page.on("requestfailed", lambda request: self.problems.append(f"request: {request.url}"))
         page.on("response", self._answered)
         page.route("**/*", self._loopback_only)
-        page.goto(address)
+        page.goto(address, timeout=_PATIENCE_MS)  # the first load may fetch a library by npm
 
     def open(self, address: str) -> None:
         """Load the page, and wait until it has opened the tileset."""
