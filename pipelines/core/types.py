@@ -4,7 +4,7 @@ Arrays are numpy's. Their shapes, units and frames are stated in docstrings, and
 """
 
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,27 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 ByteArray = NDArray[np.uint8]
 
+# Arrays of kernels, named by their shapes: N rows, K columns, an image of H × W pixels with C channels. Numba
+# compiles a kernel for the precision that it is given.
+ArrayN = NDArray[Any]
+ArrayN3 = NDArray[Any]
+ArrayN4 = NDArray[Any]
+ArrayNK = NDArray[Any]
+ArrayNK3 = NDArray[Any]
+Array33 = NDArray[Any]
+Array34 = NDArray[Any]
+ArrayHW = NDArray[Any]
+ArrayHWC = NDArray[Any]
+ArrayNHW = NDArray[Any]
+
+Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 Quaternion = Vector4
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Matrix34 = tuple[Vector4, Vector4, Vector4]
 Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
+Matrix9 = tuple[float, float, float, float, float, float, float, float, float]  # (3, 3), row by row
 Row7 = tuple[float, float, float, float, float, float, float]
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from pipelines.core.types import ArrayHW, ArrayN, ArrayNHW, ArrayNK
 from pipelines.splat.kernel_cache import kernel
 
 RADIUS = 5
@@ -34,7 +35,7 @@ def gaussian_taps(dtype: Any) -> np.ndarray:
 
 
 @njit(fastmath=_FAST)
-def _blur_along_row(padded: Any, taps: Any, out: Any) -> None:
+def _blur_along_row(padded: ArrayN, taps: ArrayN, out: ArrayN) -> None:
     k0, k1, k2, k3, k4, k5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
     for j in range(out.shape[0]):
         out[j] = (
@@ -48,7 +49,7 @@ def _blur_along_row(padded: Any, taps: Any, out: Any) -> None:
 
 
 @njit(fastmath=_FAST)
-def _blur_across_rows(ring: Any, row: int, taps: Any, out: Any) -> None:
+def _blur_across_rows(ring: Any, row: int, taps: ArrayN, out: ArrayN) -> None:
     """Blur `row` across rows, from a ring (11, n) in which row r lies at r mod 11."""
     centre = ring[row % WINDOW]
     for j in range(out.shape[0]):
@@ -61,7 +62,7 @@ def _blur_across_rows(ring: Any, row: int, taps: Any, out: Any) -> None:
 
 
 @njit(fastmath=_FAST)
-def _load_masked(image: Any, valid: Any, row: int, padded: Any) -> None:
+def _load_masked(image: ArrayHW, valid: ArrayHW, row: int, padded: ArrayN) -> None:
     """Load a row between its zero margins; pixels that do not count are zero, like those outside the image."""
     source = image[row]
     for j in range(source.shape[0]):
@@ -74,7 +75,9 @@ def _load_masked(image: Any, valid: Any, row: int, padded: Any) -> None:
 
 
 @njit(fastmath=_FAST)
-def _push_moments(rendered: Any, target: Any, valid: Any, row: int, taps: Any, padded: Any, ring: Any) -> None:
+def _push_moments(
+    rendered: ArrayHW, target: ArrayHW, valid: ArrayHW, row: int, taps: ArrayN, padded: ArrayNK, ring: Any
+) -> None:
     """Blur x, y, x², y², xy of a row along the row, into the five rings (5, 11, n)."""
     slot, n = row % WINDOW, rendered.shape[1]
     if row >= rendered.shape[0]:
@@ -97,7 +100,7 @@ def _push_moments(rendered: Any, target: Any, valid: Any, row: int, taps: Any, p
 
 
 @njit(fastmath=_FAST)
-def _ssim_row(moments: Any, c1: Any, c2: Any, partials: Any, row: int) -> None:
+def _ssim_row(moments: Any, c1: Any, c2: Any, partials: ArrayNHW, row: int) -> None:
     """Write SSIM of a row into moments[0], its derivatives by the blurred x, x² and xy into partials (3, H, n)."""
     mu_x, mu_y, xx, yy, xy = moments[0], moments[1], moments[2], moments[3], moments[4]
     one = c1 / c1  # of the images' type: a literal would turn the loop to float64
@@ -117,7 +120,7 @@ def _ssim_row(moments: Any, c1: Any, c2: Any, partials: Any, row: int) -> None:
 
 
 @njit(fastmath=_FAST)
-def _sum_row(x: Any, y: Any, ssim: Any) -> tuple[float, float]:
+def _sum_row(x: ArrayN, y: ArrayN, ssim: ArrayN) -> tuple[float, float]:
     """Return Σ|x − y| and Σ SSIM of a row, in float64."""
     absolute, similarity = 0.0, 0.0
     for j in range(x.shape[0]):
@@ -128,7 +131,7 @@ def _sum_row(x: Any, y: Any, ssim: Any) -> tuple[float, float]:
 
 
 @njit(fastmath=_FAST)
-def _clear_invalid(valid: Any, row: int, ssim: Any, partials: Any) -> None:
+def _clear_invalid(valid: ArrayHW, row: int, ssim: ArrayN, partials: ArrayNHW) -> None:
     for x in range(valid.shape[1]):
         if not valid[row, x]:
             for j in range(3 * x, 3 * x + 3):
@@ -139,7 +142,15 @@ def _clear_invalid(valid: Any, row: int, ssim: Any, partials: Any) -> None:
 
 @kernel(parallel=True, fastmath=_FAST)
 def ssim_forward(
-    rendered: Any, target: Any, valid: Any, taps: Any, c1: Any, c2: Any, bands: int, partials: Any, sums: Any
+    rendered: ArrayHW,
+    target: ArrayHW,
+    valid: ArrayHW,
+    taps: ArrayN,
+    c1: Any,
+    c2: Any,
+    bands: int,
+    partials: ArrayNHW,
+    sums: Any,
 ) -> None:
     """Write Σ|x − y| and Σ SSIM of each row into sums (H, 2), and SSIM's derivatives into partials (3, H, n).
 
@@ -173,7 +184,7 @@ def ssim_forward(
 
 
 @njit(fastmath=_FAST)
-def _push_partials(partials: Any, row: int, taps: Any, padded: Any, ring: Any) -> None:
+def _push_partials(partials: ArrayNHW, row: int, taps: ArrayN, padded: ArrayN, ring: Any) -> None:
     slot = row % WINDOW
     if row >= partials.shape[1]:
         ring[:, slot] = 0
@@ -186,7 +197,7 @@ def _push_partials(partials: Any, row: int, taps: Any, padded: Any, ring: Any) -
 
 
 @njit(fastmath=_FAST)
-def _gradient_row(x: Any, y: Any, blurred: Any, l1_weight: Any, ssim_weight: Any, out: Any) -> None:
+def _gradient_row(x: ArrayN, y: ArrayN, blurred: Any, l1_weight: Any, ssim_weight: Any, out: ArrayN) -> None:
     by_mu, by_xx, by_xy = blurred[0], blurred[1], blurred[2]
     for j in range(out.shape[0]):
         difference = x[j] - y[j]
@@ -197,15 +208,15 @@ def _gradient_row(x: Any, y: Any, blurred: Any, l1_weight: Any, ssim_weight: Any
 
 @kernel(parallel=True, fastmath=_FAST)
 def ssim_backward(
-    rendered: Any,
-    target: Any,
-    valid: Any,
-    partials: Any,
-    taps: Any,
+    rendered: ArrayHW,
+    target: ArrayHW,
+    valid: ArrayHW,
+    partials: ArrayNHW,
+    taps: ArrayN,
     l1_weight: Any,
     ssim_weight: Any,
     bands: int,
-    gradient: Any,
+    gradient: ArrayHW,
 ) -> None:
     """Write ∂(l1_weight · Σ|x − y| − ssim_weight · Σ SSIM)/∂x into gradient (H, n).
 

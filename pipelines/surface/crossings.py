@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import ArrayN, ArrayN3, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.kernel_cache import kernel
 
@@ -63,15 +63,15 @@ def seen_surfels(surfels: Surfels, cam_from_world: FloatArray, center: FloatArra
 
 @kernel(nogil=True, error_model="numpy")
 def _draw(
-    points: Any,
-    normals: Any,
-    radii: Any,
-    intrinsics: Any,
+    points: ArrayN3,
+    normals: ArrayN3,
+    radii: ArrayN,
+    intrinsics: ArrayN,
     width: int,
     height: int,
-    nearest: Any,
-    pixel: Any,
-    depth_at_pixel: Any,
+    nearest: ArrayN,
+    pixel: ArrayN,
+    depth_at_pixel: ArrayN,
 ) -> None:
     """Draw discs in camera coordinates into a depth buffer.
 
@@ -124,7 +124,7 @@ def count_beams(
 
 
 @kernel(nogil=True, error_model="numpy")
-def _cross(end: Any, start: Any, low: Any, cell_m: float, count: Any) -> None:
+def _cross(end: ArrayN3, start: ArrayN3, low: Any, cell_m: float, count: Any) -> None:
     for p in range(len(end)):
         dx, dy, dz = start[p, 0] - end[p, 0], start[p, 1] - end[p, 1], start[p, 2] - end[p, 2]
         length = np.sqrt(dx * dx + dy * dy + dz * dz)

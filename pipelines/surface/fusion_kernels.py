@@ -7,7 +7,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipelines.core.types import ByteArray, Float32Array, FloatArray, IntArray
+from pipelines.core.types import (
+    Array33,
+    ArrayHW,
+    ArrayHWC,
+    ArrayN,
+    ArrayN3,
+    ArrayNK,
+    ByteArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+)
 from pipelines.geometry.footprints import voxel_keys
 from pipelines.splat.kernel_cache import kernel
 
@@ -59,7 +70,9 @@ def chosen_pixels(
 
 
 @njit(nogil=True, error_model="numpy")
-def _surface_at(depth: Any, row: int, column: int, lens: Any, turn: Any, center: Any) -> tuple[float, float, float]:
+def _surface_at(
+    depth: ArrayHW, row: int, column: int, lens: Any, turn: Array33, center: ArrayN
+) -> tuple[float, float, float]:
     """Return the place of a pixel's surface."""
     z = np.float64(depth[row, column])
     x, y = z * ((column + 0.5 - lens[2]) / lens[0]), z * ((row + 0.5 - lens[3]) / lens[1])
@@ -72,7 +85,7 @@ def _surface_at(depth: Any, row: int, column: int, lens: Any, turn: Any, center:
 
 @njit(nogil=True, error_model="numpy")
 def _window(
-    depth: Any, lens: Any, turn: Any, center: Any, box: Any, reach: int, look: int
+    depth: ArrayHW, lens: Any, turn: Array33, center: ArrayN, box: Any, reach: int, look: int
 ) -> tuple[int, int, int, int]:
     """Return the rows and columns that show a box; parts narrower than `look` may be missed."""
     height, width = depth.shape
@@ -98,11 +111,11 @@ def _window(
 
 @kernel(nogil=True, error_model="numpy")
 def _chosen(
-    depth: Any,
-    rgb: Any,
+    depth: ArrayHW,
+    rgb: ArrayHWC,
     lens: Any,
-    turn: Any,
-    center: Any,
+    turn: Array33,
+    center: ArrayN,
     scale: float,
     box: Any,
     window: Any,
@@ -180,7 +193,7 @@ def _keys(position: FloatArray, side_m: float) -> IntArray:
 
 
 @kernel(nogil=True, error_model="numpy")
-def _extent(position: Any, side_m: float) -> Any:
+def _extent(position: ArrayN3, side_m: float) -> Any:
     """Return the least voxel (3,) of points, and how many there are (3,) along each axis."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for row in range(len(position)):
@@ -191,7 +204,7 @@ def _extent(position: Any, side_m: float) -> Any:
 
 
 @kernel(nogil=True, error_model="numpy")
-def _numbered(position: Any, side_m: float, low: Any, extent: Any) -> Any:
+def _numbered(position: ArrayN3, side_m: float, low: ArrayN, extent: ArrayN) -> Any:
     key = np.empty(len(position), np.int64)
     for row in range(len(position)):
         number = 0
@@ -249,7 +262,7 @@ def _slot(table: Any, own: Any, key: int, bits: int) -> Any:
 
 
 @kernel(nogil=True, error_model="numpy")
-def _add_rows(voxel: Any, values: Any, sums: Any) -> None:
+def _add_rows(voxel: ArrayN, values: ArrayNK, sums: ArrayNK) -> None:
     """Add values (P, K) to the sums (V, K) of their voxels."""
     for row in range(len(values)):
         for k in range(values.shape[1]):

@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
+from pipelines.core.types import ArrayHWC, ArrayN3, ArrayNK, BoolArray, ByteArray, FloatArray, IntArray
 from pipelines.geometry.footprints import row_numbers, voxel_keys
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.kernel_cache import kernel
@@ -85,7 +85,14 @@ def _near_each_other(places: FloatArray) -> list[IntArray]:
 
 @kernel(parallel=True, nogil=True, error_model="numpy")
 def _add_colours(
-    points: Any, normals: Any, views: Any, view: int, photo: Any, plain: Any, score: Any, colour: Any
+    points: ArrayN3,
+    normals: ArrayN3,
+    views: Any,
+    view: int,
+    photo: ArrayHWC,
+    plain: ArrayNK,
+    score: Any,
+    colour: Any,
 ) -> None:
     """Put a view among the best of the places that its depth map shows; scores are pixels on a square metre."""
     rotations, centers, intrinsics_px, sizes, starts, depth = views
@@ -119,7 +126,7 @@ def _add_colours(
 
 
 @njit(nogil=True, error_model="numpy")
-def _bilinear(photo: Any, column: float, row: float, band: int) -> float:
+def _bilinear(photo: ArrayHWC, column: float, row: float, band: int) -> float:
     i, j = int(row), int(column)
     down, right = row - i, column - j
     above = (1 - right) * photo[i, j, band] + right * photo[i, j + 1, band]

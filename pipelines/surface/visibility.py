@@ -21,7 +21,7 @@ from numba import njit, prange
 from scipy.ndimage import minimum_filter
 
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from pipelines.core.types import Array33, ArrayN, ArrayN3, ArrayNK, BoolArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.footprints import rows_by_square
 from pipelines.splat.kernel_cache import kernel
@@ -147,7 +147,7 @@ def _blocks(points: FloatArray) -> IntArray:
 
 
 @njit(nogil=True, error_model="numpy")
-def point_in_cam(point: Any, rotation: Any, center: Any) -> tuple[float, float, float]:
+def point_in_cam(point: ArrayN, rotation: Array33, center: ArrayN) -> tuple[float, float, float]:
     """Return a point in the camera's axes, from world coordinates, rotation cam ← world (3, 3) and centre."""
     x, y, z = 0.0, 0.0, 0.0
     for k in range(3):
@@ -159,7 +159,9 @@ def point_in_cam(point: Any, rotation: Any, center: Any) -> tuple[float, float, 
 
 
 @kernel(nogil=True, error_model="numpy")
-def sees_sphere(middle: Any, radius: float, rotation: Any, center: Any, intrinsics: Any, size: Any) -> bool:
+def sees_sphere(
+    middle: ArrayN, radius: float, rotation: Array33, center: ArrayN, intrinsics: ArrayN, size: ArrayN
+) -> bool:
     """Return whether a sphere may touch the frustum of a camera."""
     x, y, z = point_in_cam(middle, rotation, center)
     if z < -radius:
@@ -174,7 +176,7 @@ def sees_sphere(middle: Any, radius: float, rotation: Any, center: Any, intrinsi
 
 
 @njit(nogil=True, error_model="numpy")
-def surface_at(depth: Any, start: int, width: int, height: int, u: float, v: float) -> float:
+def surface_at(depth: ArrayN, start: int, width: int, height: int, u: float, v: float) -> float:
     """Return the depth of a view's surface at a place on its image; 0: none."""
     own = depth[start + int(v) * width + int(u)]
     column = min(max(int(np.floor(u - 0.5)), 0), width - 2)
@@ -196,7 +198,7 @@ def surface_at(depth: Any, start: int, width: int, height: int, u: float, v: flo
 
 @njit(nogil=True, error_model="numpy")
 def _add_view(
-    row: int, points: Any, normals: Any, views: Any, view: int, up: Any, tolerance: float, sums: Any
+    row: int, points: ArrayN3, normals: ArrayN3, views: Any, view: int, up: ArrayN, tolerance: float, sums: ArrayNK
 ) -> None:
     """Add a view to the sums of a point. Numbers rather than rows of arrays, each of which would be counted."""
     rotations, centers, intrinsics, sizes, starts, depth = views
@@ -244,7 +246,9 @@ def _add_view(
 
 
 @njit(nogil=True, error_model="numpy")
-def _sum_block(rows: Any, points: Any, normals: Any, views: Any, up: Any, tolerance: float, sums: Any) -> None:
+def _sum_block(
+    rows: ArrayN, points: ArrayN3, normals: ArrayN3, views: Any, up: ArrayN, tolerance: float, sums: ArrayNK
+) -> None:
     """Add all views to the sums of the points of one block."""
     low, high = points[rows[0]].copy(), points[rows[0]].copy()
     for row in rows:
@@ -262,7 +266,9 @@ def _sum_block(rows: Any, points: Any, normals: Any, views: Any, up: Any, tolera
 
 
 @kernel(parallel=True, nogil=True, error_model="numpy")
-def _sum_support(points: Any, normals: Any, order: Any, views: Any, up: Any, tolerance: float, sums: Any) -> None:
+def _sum_support(
+    points: ArrayN3, normals: ArrayN3, order: ArrayN, views: Any, up: ArrayN, tolerance: float, sums: ArrayNK
+) -> None:
     """Fill the sums (N, _SUMS) of all points, block by block; `order` puts the points of a block together."""
     for block in prange((len(order) + _BLOCK - 1) // _BLOCK):
         rows = order[block * _BLOCK : min((block + 1) * _BLOCK, len(order))]

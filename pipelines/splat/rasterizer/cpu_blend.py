@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from pipelines.core.types import ArrayN, ArrayN3, ArrayNK
 from pipelines.splat.rasterizer.api import ALPHA_MAX, TRANSMITTANCE_MIN
 from pipelines.splat.rasterizer.cpu_lanes import (
     LANES,
@@ -62,7 +63,7 @@ def pixel_centers(dtype: Any) -> Any:
 
 
 @jit
-def row_exponent(table: Any, index: int, dx: Any, dy: Any) -> Any:
+def row_exponent(table: ArrayNK, index: int, dx: Any, dy: Any) -> Any:
     """Return ln α of one splat along a row of pixels, before the cut-offs."""
     slanted = splat(table[index, FACTOR_XX]) * dx + splat(table[index, FACTOR_XY] * dy)
     vertical = table[index, FACTOR_YY] * dy
@@ -70,13 +71,13 @@ def row_exponent(table: Any, index: int, dx: Any, dy: Any) -> Any:
 
 
 @jit
-def row_depth(table: Any, index: int, dx: Any, dy: Any) -> Any:
+def row_depth(table: ArrayNK, index: int, dx: Any, dy: Any) -> Any:
     """Return z of one splat along a row of pixels."""
     return splat(table[index, SLOPE_X]) * dx + splat(table[index, DEPTH] + table[index, SLOPE_Y] * dy)
 
 
 @jit
-def start_tile(scratch: Any, tile_x: int, tile_y: int, width: int, height: int) -> None:
+def start_tile(scratch: ArrayN, tile_x: int, tile_y: int, width: int, height: int) -> None:
     """Set T = 1 for pixels inside the image; pixels outside are done from the start. Other planes start at 0."""
     number = scratch.dtype.type
     for k in range(scratch.shape[0]):
@@ -88,7 +89,7 @@ def start_tile(scratch: Any, tile_x: int, tile_y: int, width: int, height: int) 
 
 
 @jit
-def alive_rows(scratch: Any, top: int, bottom: int) -> Any:
+def alive_rows(scratch: ArrayN, top: int, bottom: int) -> Any:
     """Return first and last row of top … bottom with a pixel that is not done; top > bottom if there is none."""
     while top <= bottom and not any_positive(load(scratch, T * TILE_PIXELS + top * TILE_WIDTH)):
         top += 1
@@ -98,8 +99,10 @@ def alive_rows(scratch: Any, top: int, bottom: int) -> Any:
 
 
 @jit
-def _blend_tile(table: Any, normals: Any, hits: Any, first: int, last: int, tile_x: int, tile_y: int, depth: bool,
-                scratch: Any, lane_x: Any) -> int:  # fmt: skip
+def _blend_tile(
+    table: ArrayNK, normals: ArrayN3, hits: ArrayN, first: int, last: int, tile_x: int, tile_y: int, depth: bool,
+    scratch: ArrayN, lane_x: ArrayN,
+) -> int:  # fmt: skip
     """Blend hits first … last − 1 into the tile's scratch planes; return the hit after the last one used."""
     number = table.dtype.type
     zero, one, half = splat(number(0.0)), splat(number(1.0)), splat(number(0.5))
@@ -145,7 +148,7 @@ def _blend_tile(table: Any, normals: Any, hits: Any, first: int, last: int, tile
 
 
 @jit
-def _finish_tile(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any) -> None:
+def _finish_tile(scratch: ArrayN, tile_x: int, tile_y: int, background: ArrayN, images: tuple[Any, ...]) -> None:
     colour, alpha, depth, depth2, median, normal = images
     for row in range(min(TILE_HEIGHT, colour.shape[0] - tile_y)):
         for column in range(min(TILE_WIDTH, colour.shape[1] - tile_x)):
@@ -167,8 +170,8 @@ def _finish_tile(scratch: Any, tile_x: int, tile_y: int, background: Any, images
 
 @worker_jit
 def _blend(
-    table: Any, normals: Any, hits: Any, tile_start: Any, background: Any, images: Any, tile_end: Any, worker: int,
-    workers: int,
+    table: ArrayNK, normals: ArrayN3, hits: ArrayN, tile_start: ArrayN, background: ArrayN,
+    images: tuple[Any, ...], tile_end: ArrayN, worker: int, workers: int,
 ) -> None:  # fmt: skip
     height, width = images[1].shape
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
@@ -186,7 +189,14 @@ def _blend(
 
 @parallel_jit
 def blend(
-    table: Any, normals: Any, hits: Any, tile_start: Any, background: Any, images: Any, tile_end: Any, workers: int
+    table: ArrayNK,
+    normals: ArrayN3,
+    hits: ArrayN,
+    tile_start: ArrayN,
+    background: ArrayN,
+    images: tuple[Any, ...],
+    tile_end: ArrayN,
+    workers: int,
 ) -> None:
     """Blend the splats of all tiles into images.
 
@@ -216,7 +226,9 @@ NORMAL_WIDTH = 4  # of ∂L/∂ normal of a hit, with a zero behind it
 
 
 @jit
-def _start_tile_gradient(scratch: Any, tile_x: int, tile_y: int, background: Any, images: Any, grads: Any) -> None:
+def _start_tile_gradient(
+    scratch: ArrayN, tile_x: int, tile_y: int, background: ArrayN, images: tuple[Any, ...], grads: tuple[Any, ...]
+) -> None:
     """Fill the scratch planes with the gradient of each pixel's colour, alpha and depth.
 
     With v_i = g·c_i + g_z z_i + g_zz z_i² + g_n·n_i − (g·background − g_alpha) the loss is Σ w_i v_i + constant.
@@ -248,7 +260,7 @@ def _start_tile_gradient(scratch: Any, tile_x: int, tile_y: int, background: Any
 
 
 @jit
-def _store_hit_gradient(gradient: Any, place: int, dx: Any, moments: Any, colour_and_depth: Any) -> None:
+def _store_hit_gradient(gradient: ArrayN, place: int, dx: Any, moments: Any, colour_and_depth: Any) -> None:
     """Sum a hit's gradient over the columns, in each of which dx is constant."""
     q, qy, qyy = moments
     red, green, blue, depth, slope_y = colour_and_depth
@@ -260,8 +272,8 @@ def _store_hit_gradient(gradient: Any, place: int, dx: Any, moments: Any, colour
 
 @jit
 def _blend_tile_gradient(  # noqa: PLR0915  (one loop, whose sums stay in registers)
-    table: Any, normals: Any, hits: Any, first: int, last: int, tile_x: int, tile_y: int, depth: bool, scratch: Any,
-    lane_x: Any, gradient: Any, normal_gradient: Any,
+    table: ArrayNK, normals: ArrayN3, hits: ArrayN, first: int, last: int, tile_x: int, tile_y: int, depth: bool,
+    scratch: ArrayN, lane_x: ArrayN, gradient: ArrayN, normal_gradient: ArrayN,
 ) -> None:  # fmt: skip
     """Write the gradient of hits first … last − 1; `scratch` as `start_tile` and `_start_tile_gradient` left it.
 
@@ -334,8 +346,9 @@ def _blend_tile_gradient(  # noqa: PLR0915  (one loop, whose sums stay in regist
 
 @worker_jit
 def _blend_gradient(
-    table: Any, normals: Any, hits: Any, tile_start: Any, tile_end: Any, background: Any, images: Any, grads: Any,
-    gradient: Any, normal_gradient: Any, worker: int, workers: int,
+    table: ArrayNK, normals: ArrayN3, hits: ArrayN, tile_start: ArrayN, tile_end: ArrayN, background: ArrayN,
+    images: tuple[Any, ...], grads: tuple[Any, ...], gradient: ArrayN, normal_gradient: ArrayN, worker: int,
+    workers: int,
 ) -> None:  # fmt: skip
     height, width = images[1].shape
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
@@ -357,8 +370,8 @@ def _blend_gradient(
 
 @parallel_jit
 def blend_gradient(
-    table: Any, normals: Any, hits: Any, tile_start: Any, tile_end: Any, background: Any, images: Any, grads: Any,
-    gradient: Any, normal_gradient: Any, workers: int,
+    table: ArrayNK, normals: ArrayN3, hits: ArrayN, tile_start: ArrayN, tile_end: ArrayN, background: ArrayN,
+    images: tuple[Any, ...], grads: tuple[Any, ...], gradient: ArrayN, normal_gradient: ArrayN, workers: int,
 ) -> None:  # fmt: skip
     """Write the derivative of `blend`.
 

@@ -15,7 +15,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipelines.core.types import FloatArray
+from pipelines.core.types import (
+    Array34,
+    ArrayN,
+    ArrayN3,
+    ArrayN4,
+    ArrayNK3,
+    FloatArray,
+    Matrix9,
+    Vector2,
+    Vector3,
+    Vector4,
+)
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.rasterizer.api import ALPHA_MIN, DEPTH_REACH, SLOPE_DILATION, RasterSettings
 from pipelines.splat.rasterizer.cpu_lanes import jit
@@ -35,7 +46,7 @@ MAX_COEFFICIENTS = 16
 
 
 @jit
-def sh_basis(direction: Any, degree: int, basis: Any) -> None:
+def sh_basis(direction: Vector3, degree: int, basis: ArrayN) -> None:
     """Write the (degree + 1)² functions of a unit vector (x, y, z) into `basis` (16,)."""
     x, y, z = direction
     basis[0] = _C0
@@ -62,7 +73,7 @@ def sh_basis(direction: Any, degree: int, basis: Any) -> None:
 
 
 @jit
-def sh_direction_gradient(direction: Any, degree: int, weight: Any) -> Any:
+def sh_direction_gradient(direction: Vector3, degree: int, weight: ArrayN) -> Any:
     """Return Σ_k weight[k] · ∂basis[k]/∂(x, y, z), with the polynomials as functions of all space."""
     x, y, z = direction
     gx, gy, gz = 0.0, 0.0, 0.0
@@ -94,7 +105,7 @@ _SPREAD_MAX = DEPTH_REACH / WIDEST
 
 
 @jit
-def _free_slope(axes: Any, variance: Any, narrow: Any) -> Any:
+def _free_slope(axes: Matrix9, variance: Vector3, narrow: Vector3) -> Any:
     """Return K⁻¹ (xx, xy, yy) and p (2), given V (9), D (3) and K (xx, xy, yy)."""
     a, b, c = variance
     xz = axes[0] * axes[6] * a + axes[1] * axes[7] * b + axes[2] * axes[8] * c
@@ -106,7 +117,7 @@ def _free_slope(axes: Any, variance: Any, narrow: Any) -> Any:
 
 
 @jit
-def _narrow(cov: Any, dilation: float) -> Any:
+def _narrow(cov: Vector3, dilation: float) -> Any:
     """Return K of C (xx, xy, yy), which is dilated by `dilation`."""
     xx, xy, yy = cov
     less = (1 - SLOPE_DILATION) * dilation
@@ -114,7 +125,7 @@ def _narrow(cov: Any, dilation: float) -> Any:
 
 
 @jit
-def _times(symmetric: Any, vector: Any) -> Any:
+def _times(symmetric: Vector3, vector: Vector2) -> Any:
     xx, xy, yy = symmetric
     x, y = vector
     return xx * x + xy * y, xy * x + yy * y
@@ -128,7 +139,7 @@ def _shrinkage(spread2: float, depth: float) -> float:
 
 
 @jit
-def depth_slope(axes: Any, variance: Any, cov: Any, dilation: float, depth: float) -> Any:
+def depth_slope(axes: Matrix9, variance: Vector3, cov: Vector3, dilation: float, depth: float) -> Any:
     """Return ∂z/∂u, ∂z/∂v of a Gaussian in m/px, given V (9), D (3), C (xx, xy, yy) and its dilation, and z."""
     _, (px, py) = _free_slope(axes, variance, _narrow(cov, dilation))
     wide_x, wide_y = _times(cov, (px, py))
@@ -137,7 +148,9 @@ def depth_slope(axes: Any, variance: Any, cov: Any, dilation: float, depth: floa
 
 
 @jit
-def depth_slope_gradient(axes: Any, variance: Any, cov: Any, dilation: float, depth: float, g_slope: Any) -> Any:
+def depth_slope_gradient(
+    axes: Matrix9, variance: Vector3, cov: Vector3, dilation: float, depth: float, g_slope: Vector2
+) -> Any:
     """Return the slope and, given ∂L/∂ slope, ∂L/∂c (2), the symmetric ∂L/∂C (xx, xy, yy) and ∂L/∂z.
 
     K and C differ by a constant: ∂L/∂C is that of both.
@@ -211,13 +224,13 @@ def make_view(camera: Pinhole, settings: RasterSettings, pose: FloatArray) -> Vi
 
 
 @jit
-def row3(array: Any, i: int) -> Any:
+def row3(array: ArrayN3, i: int) -> Any:
     """Return row i of an array (N, 3) as three numbers in double precision."""
     return float(array[i, 0]), float(array[i, 1]), float(array[i, 2])
 
 
 @jit
-def transformed_point(pose: Any, mean: Any) -> Any:
+def transformed_point(pose: Array34, mean: Vector3) -> Any:
     """Return (x, y, z) of a point under the rigid transformation `pose` (3, 4)."""
     x, y, z = mean
     return (
@@ -228,7 +241,7 @@ def transformed_point(pose: Any, mean: Any) -> Any:
 
 
 @jit
-def unit_quat(quats: Any, i: int) -> Any:
+def unit_quat(quats: ArrayN4, i: int) -> Any:
     """Return row i of (N, 4) quaternions at unit length, and the reciprocal of the length."""
     w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
     scale = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
@@ -236,7 +249,7 @@ def unit_quat(quats: Any, i: int) -> Any:
 
 
 @jit
-def rotation(quat: Any) -> Any:
+def rotation(quat: Vector4) -> Any:
     """Return the rotation matrix (9) of a unit quaternion (w, x, y, z)."""
     w, x, y, z = quat
     return (
@@ -247,7 +260,7 @@ def rotation(quat: Any) -> Any:
 
 
 @jit
-def shortest_axis(log_scales: Any, i: int) -> int:
+def shortest_axis(log_scales: ArrayN3, i: int) -> int:
     """Return the principal axis (0, 1 or 2) of the smallest deviation of Gaussian i; the first of equal ones."""
     a, b, c = row3(log_scales, i)
     shortest = 1 if b < a else 0
@@ -255,7 +268,7 @@ def shortest_axis(log_scales: Any, i: int) -> int:
 
 
 @jit
-def facing_normal(turn: Any, axis: int, ray: Any) -> Any:
+def facing_normal(turn: Matrix9, axis: int, ray: Vector3) -> Any:
     """Return a column of a rotation matrix (9), and the sign that it is multiplied by to point against a ray."""
     x, y, z = turn[0], turn[3], turn[6]
     if axis == 1:
@@ -267,14 +280,14 @@ def facing_normal(turn: Any, axis: int, ray: Any) -> Any:
 
 
 @jit
-def variances(log_scales: Any, i: int) -> Any:
+def variances(log_scales: ArrayN3, i: int) -> Any:
     """Return the variances of Gaussian i along its principal axes, from natural logarithms of deviations (N, 3)."""
     a, b, c = row3(log_scales, i)
     return math.exp(2 * a), math.exp(2 * b), math.exp(2 * c)
 
 
 @jit
-def jacobian(view: View, point: Any) -> Any:
+def jacobian(view: View, point: Vector3) -> Any:
     """Return entries 00, 02, 11, 12 of ∂(u, v)/∂(x, y, z); the others are zero."""
     x, y, z = point
     slope_x = min(max(x / z, view.slope_x_min), view.slope_x_max)
@@ -283,7 +296,7 @@ def jacobian(view: View, point: Any) -> Any:
 
 
 @jit
-def screen_from_model(jac: Any, pose: Any) -> Any:
+def screen_from_model(jac: Vector4, pose: Array34) -> Any:
     """Return W (9), the linearised map from the model's frame to (u, v, z)."""
     j00, j02, j11, j12 = jac
     return (
@@ -298,7 +311,7 @@ def screen_from_model(jac: Any, pose: Any) -> Any:
 
 
 @jit
-def times_rotation(w: Any, r: Any) -> Any:
+def times_rotation(w: Matrix9, r: Matrix9) -> Any:
     """Return V = W R (9), the principal axes along (u, v, z)."""
     return (
         w[0] * r[0] + w[1] * r[3] + w[2] * r[6],
@@ -314,7 +327,7 @@ def times_rotation(w: Any, r: Any) -> Any:
 
 
 @jit
-def screen_covariance(axes: Any, variance: Any, dilation: float) -> Any:
+def screen_covariance(axes: Matrix9, variance: Vector3, dilation: float) -> Any:
     """Return xx, xy, yy of V diag(σ²) Vᵀ + dilation · I, of the rows u and v of V."""
     a, b, c = variance
     return (
@@ -325,7 +338,7 @@ def screen_covariance(axes: Any, variance: Any, dilation: float) -> Any:
 
 
 @jit
-def log_compensation(cov: Any, dilation: float) -> float:
+def log_compensation(cov: Vector3, dilation: float) -> float:
     """Return ln √(|C less its dilation| / |C|) of C (xx, xy, yy); −∞: seen edge-on, nothing is left."""
     xx, xy, yy = cov
     before = (xx - dilation) * (yy - dilation) - xy * xy
@@ -333,14 +346,14 @@ def log_compensation(cov: Any, dilation: float) -> float:
 
 
 @jit
-def log_opacity(logit: float, cov: Any, view: View) -> float:
+def log_opacity(logit: float, cov: Vector3, view: View) -> float:
     """Return ln of the opacity on the screen, given C (xx, xy, yy)."""
     plain = log_sigmoid(logit)
     return plain + log_compensation(cov, view.dilation) if view.mip_filter else plain
 
 
 @jit
-def compensation_gradient(cov: Any, dilation: float) -> Any:
+def compensation_gradient(cov: Vector3, dilation: float) -> Any:
     """Return the symmetric ∂/∂C (xx, xy, yy) of `log_compensation`: ½ (C less its dilation)⁻¹ − ½ C⁻¹."""
     xx, xy, yy = cov
     after = 0.5 / (xx * yy - xy * xy)
@@ -356,7 +369,7 @@ def log_sigmoid(logit: float) -> float:
 
 
 @jit
-def unit_direction(mean: Any, center: Any) -> Any:
+def unit_direction(mean: Vector3, center: ArrayN) -> Any:
     """Return the unit vector from the camera's centre to a Gaussian, and the reciprocal of their distance."""
     x, y, z = mean[0] - center[0], mean[1] - center[1], mean[2] - center[2]
     scale = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
@@ -364,7 +377,7 @@ def unit_direction(mean: Any, center: Any) -> Any:
 
 
 @jit
-def sh_colour(sh: Any, i: int, basis: Any, terms: int) -> Any:
+def sh_colour(sh: ArrayNK3, i: int, basis: ArrayN, terms: int) -> Any:
     """Return red, green and blue of Gaussian i, not clamped at zero."""
     red, green, blue = 0.5, 0.5, 0.5
     for k in range(terms):

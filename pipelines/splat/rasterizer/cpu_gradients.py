@@ -10,6 +10,18 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from pipelines.core.types import (
+    Array34,
+    ArrayN,
+    ArrayN3,
+    ArrayN4,
+    ArrayNK,
+    ArrayNK3,
+    Matrix9,
+    Vector2,
+    Vector3,
+    Vector4,
+)
 from pipelines.splat.rasterizer import cpu_gaussian as gaussian
 from pipelines.splat.rasterizer.cpu_blend import (
     D_BLUE,
@@ -33,7 +45,7 @@ from pipelines.splat.rasterizer.cpu_project import BLOCK
 
 
 @jit
-def _conic_gradients(cov: Any, sums: Any) -> Any:
+def _conic_gradients(cov: Vector3, sums: ArrayN) -> Any:
     """Return ∂L/∂ screen mean (u, v) and the symmetric ∂L/∂C (xx, xy, yy) of the screen covariance C.
 
     The exponent is −½ dᵀ C⁻¹ d, so that the gradients are C⁻¹ Σ q d and ½ C⁻¹ (Σ q d dᵀ) C⁻¹.
@@ -49,7 +61,7 @@ def _conic_gradients(cov: Any, sums: Any) -> Any:
 
 
 @jit
-def _covariance_gradients(axes: Any, variance: Any, view: View, depth: float, sums: Any) -> Any:
+def _covariance_gradients(axes: Matrix9, variance: Vector3, view: View, depth: float, sums: ArrayN) -> Any:
     """Return ∂L/∂ screen mean (2), depth of the centre, screen covariance (3), covariance with the depth (2)."""
     cov = gaussian.screen_covariance(axes, variance, view.dilation)
     (gu, gv), (xx, xy, yy) = _conic_gradients(cov, sums)
@@ -69,7 +81,7 @@ def _covariance_gradients(axes: Any, variance: Any, view: View, depth: float, su
 
 
 @jit
-def _axes_gradient(axes: Any, variance: Any, g_cov: Any, g_c: Any) -> Any:
+def _axes_gradient(axes: Matrix9, variance: Vector3, g_cov: Vector3, g_c: Vector2) -> Any:
     """Return ∂L/∂V (9), given the symmetric ∂L/∂ screen covariance and ∂L/∂ its covariance with depth."""
     xx, xy, yy = g_cov
     xz, yz = g_c
@@ -88,13 +100,13 @@ def _axes_gradient(axes: Any, variance: Any, g_cov: Any, g_c: Any) -> Any:
 
 
 @jit
-def _transposed_times(w: Any, v: Any, i: int, k: int) -> float:
+def _transposed_times(w: Matrix9, v: Matrix9, i: int, k: int) -> float:
     """Return entry (i, k) of Wᵀ V."""
     return float(w[i] * v[k] + w[3 + i] * v[3 + k] + w[6 + i] * v[6 + k])
 
 
 @jit
-def _turn_gradient(w: Any, v: Any, axis: int, normal: Any) -> Any:
+def _turn_gradient(w: Matrix9, v: Matrix9, axis: int, normal: Vector3) -> Any:
     """Return ∂L/∂R (9) = Wᵀ ∂L/∂V, plus the gradient (3) of the column `axis` as a normal."""
     nx, ny, nz = normal
     first, second, third = 1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0
@@ -112,7 +124,7 @@ def _turn_gradient(w: Any, v: Any, axis: int, normal: Any) -> Any:
 
 
 @jit
-def _quat_gradient(quat: Any, scale: float, turn: Any) -> Any:
+def _quat_gradient(quat: Vector4, scale: float, turn: Matrix9) -> Any:
     """Return ∂L/∂ quaternion (4) before normalisation, given ∂L/∂R (9)."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = turn
     qw, qx, qy, qz = quat
@@ -130,7 +142,9 @@ def _quat_gradient(quat: Any, scale: float, turn: Any) -> Any:
 
 
 @jit
-def _point_gradient(view: View, point: Any, g_mean: Any, g_depth: float, pose: Any, g_w: Any) -> Any:
+def _point_gradient(
+    view: View, point: Vector3, g_mean: Vector2, g_depth: float, pose: Array34, g_w: Matrix9
+) -> Any:
     """Return ∂L/∂ point in the camera's frame (3): through the screen mean, the depth and the Jacobian."""
     x, y, z = point
     gu, gv = g_mean
@@ -156,7 +170,7 @@ def _point_gradient(view: View, point: Any, g_mean: Any, g_depth: float, pose: A
 
 
 @jit
-def _add_pose_gradient(camera: Any, mean: Any, g_point: Any, jac: Any, g_w: Any) -> None:
+def _add_pose_gradient(camera: ArrayN, mean: Vector3, g_point: Vector3, jac: Vector4, g_w: Matrix9) -> None:
     """Add ∂L/∂[A | t] (12) of p = A m + t and W."""
     j00, j02, j11, j12 = jac
     x, y, z = mean
@@ -177,7 +191,14 @@ def _add_pose_gradient(camera: Any, mean: Any, g_point: Any, jac: Any, g_w: Any)
 
 @jit
 def colour_gradient(
-    sh: Any, i: int, direction: Any, degree: int, sums: Any, basis: Any, weight: Any, g_sh: Any
+    sh: ArrayNK3,
+    i: int,
+    direction: Vector3,
+    degree: int,
+    sums: ArrayN,
+    basis: ArrayN,
+    weight: ArrayN,
+    g_sh: ArrayNK3,
 ) -> Any:
     """Write row i of ∂L/∂ SH, and return ∂L/∂ direction, with the basis as functions of all space."""
     terms = (degree + 1) ** 2
@@ -193,7 +214,7 @@ def colour_gradient(
 
 
 @jit
-def unnormalised(direction: Any, scale: float, gradient: Any) -> Any:
+def unnormalised(direction: Vector3, scale: float, gradient: Vector3) -> Any:
     """Return ∂L/∂v of a vector v, given ∂L/∂ direction of direction = scale · v of unit length."""
     x, y, z = direction
     gx, gy, gz = gradient
@@ -202,8 +223,10 @@ def unnormalised(direction: Any, scale: float, gradient: Any) -> Any:
 
 
 @jit
-def geometry_gradient(quats: Any, log_scales: Any, i: int, mean: Any, direction: Any, pose: Any, view: View,
-                      sums: Any, g_normal: Any, camera: Any, g_quats: Any, g_log_scales: Any) -> Any:  # fmt: skip
+def geometry_gradient(
+    quats: ArrayN4, log_scales: ArrayN3, i: int, mean: Vector3, direction: Vector3, pose: Array34, view: View,
+    sums: ArrayN, g_normal: ArrayN, camera: ArrayN, g_quats: ArrayN4, g_log_scales: ArrayN3,
+) -> Any:  # fmt: skip
     """Write row i of ∂L/∂ quaternion and log scales, add to ∂L/∂ pose; return ∂L/∂ point and screen mean."""
     point = gaussian.transformed_point(pose, mean)
     quat, scale = gaussian.unit_quat(quats, i)
@@ -236,7 +259,9 @@ CAMERA_WIDTH = 15
 
 
 @jit
-def _sum_hits(gradient: Any, width: int, places: Any, splat_start: Any, first: int, last: int, sums: Any) -> None:
+def _sum_hits(
+    gradient: ArrayN, width: int, places: ArrayN, splat_start: ArrayN, first: int, last: int, sums: ArrayNK
+) -> None:
     """Write the sums (last − first, width) of the hits of some splats.
 
     Hits lie by tile: nearly each is a cache miss. A loop that does nothing else has many of them under way.
@@ -253,10 +278,11 @@ def _sum_hits(gradient: Any, width: int, places: Any, splat_start: Any, first: i
 
 @worker_jit
 def _gaussian_gradients(
-    means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, gradient: Any, normal_gradient: Any, splat_start: Any, places: Any,
-    block_start: Any, g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any, camera: Any,
-    g_screen: Any, worker: int, workers: int,
+    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, sh: ArrayNK3, pose: Array34,
+    center: ArrayN, view: View, degree: int, visible: ArrayN, gradient: ArrayN, normal_gradient: ArrayN,
+    splat_start: ArrayN, places: ArrayN, block_start: ArrayN, g_means: ArrayN3, g_quats: ArrayN4,
+    g_log_scales: ArrayN3, g_logits: ArrayN, g_sh: ArrayNK3, camera: ArrayNK, g_screen: ArrayNK, worker: int,
+    workers: int,
 ) -> None:  # fmt: skip
     block_sums, share = np.empty((BLOCK, HIT_GRADIENT_WIDTH)), np.empty(CAMERA_WIDTH)
     basis, weight = np.empty(MAX_COEFFICIENTS), np.empty(MAX_COEFFICIENTS)
@@ -293,10 +319,10 @@ def _gaussian_gradients(
 
 @parallel_jit
 def gaussian_gradients(
-    means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, gradient: Any, normal_gradient: Any, splat_start: Any, places: Any,
-    block_start: Any, g_means: Any, g_quats: Any, g_log_scales: Any, g_logits: Any, g_sh: Any, camera: Any,
-    g_screen: Any, workers: int,
+    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, sh: ArrayNK3, pose: Array34,
+    center: ArrayN, view: View, degree: int, visible: ArrayN, gradient: ArrayN, normal_gradient: ArrayN,
+    splat_start: ArrayN, places: ArrayN, block_start: ArrayN, g_means: ArrayN3, g_quats: ArrayN4,
+    g_log_scales: ArrayN3, g_logits: ArrayN, g_sh: ArrayNK3, camera: ArrayNK, g_screen: ArrayNK, workers: int,
 ) -> None:  # fmt: skip
     """Sum the gradients of hits by Gaussian, and propagate them back through the projection and the colours.
 

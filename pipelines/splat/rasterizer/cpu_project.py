@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from pipelines.core.types import Array34, ArrayN, ArrayN3, ArrayN4, ArrayNK, ArrayNK3, Vector2, Vector3
 from pipelines.splat.rasterizer import cpu_gaussian as gaussian
 from pipelines.splat.rasterizer.api import ALPHA_MIN
 from pipelines.splat.rasterizer.cpu_gaussian import MAX_COEFFICIENTS, WIDEST, View
@@ -35,7 +36,7 @@ ELLIPSE_WIDTH = 6
 
 
 @jit
-def _ellipse(means: Any, quats: Any, log_scales: Any, pose: Any, view: View, i: int) -> Any:
+def _ellipse(means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, pose: Array34, view: View, i: int) -> Any:
     """Return the point in the camera's frame, screen covariance and slope of the depth of Gaussian i."""
     point = gaussian.transformed_point(pose, gaussian.row3(means, i))
     quat, _ = gaussian.unit_quat(quats, i)
@@ -55,7 +56,7 @@ def _holds_pixel(center: float, extent: float, size: float) -> bool:
 
 
 @jit
-def _may_reach_image(point: Any, largest_log_scale: float, view: View) -> bool:
+def _may_reach_image(point: Vector3, largest_log_scale: float, view: View) -> bool:
     """Return False only if a sphere around the Gaussian surely projects outside the image: a cheap first test."""
     x, y, z = point
     sigma = math.exp(largest_log_scale) / z
@@ -66,7 +67,9 @@ def _may_reach_image(point: Any, largest_log_scale: float, view: View) -> bool:
 
 
 @jit
-def _is_visible(means: Any, quats: Any, log_scales: Any, logit: float, pose: Any, view: View, i: int) -> bool:
+def _is_visible(
+    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit: float, pose: Array34, view: View, i: int
+) -> bool:
     """Return whether the ellipse in which Gaussian i reaches ALPHA_MIN has a pixel in its bounding box.
 
     Comparisons are written so that NaN anywhere makes the Gaussian invisible.
@@ -85,7 +88,9 @@ def _is_visible(means: Any, quats: Any, log_scales: Any, logit: float, pose: Any
 
 
 @jit
-def _is_surely_visible(quats: Any, log_scales: Any, logit: float, point: Any, view: View, i: int) -> bool:
+def _is_surely_visible(
+    quats: ArrayN4, log_scales: ArrayN3, logit: float, point: Vector3, view: View, i: int
+) -> bool:
     """Return True only for a centre in the image whose ellipse holds a pixel by the image's dilation alone.
 
     With the filter, opacities depend on the ellipse.
@@ -110,8 +115,8 @@ def _is_surely_visible(quats: Any, log_scales: Any, logit: float, point: Any, vi
 
 @worker_jit
 def _find_visible(
-    means: Any, quats: Any, log_scales: Any, logit_opacities: Any, pose: Any, view: View, roughly: bool,
-    visible: Any, depth: Any, worker: int, workers: int,
+    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, pose: Array34, view: View,
+    roughly: bool, visible: ArrayN, depth: ArrayN, worker: int, workers: int,
 ) -> None:  # fmt: skip
     for block in range(worker, (means.shape[0] + BLOCK - 1) // BLOCK, workers):
         for i in range(block * BLOCK, min((block + 1) * BLOCK, means.shape[0])):
@@ -132,8 +137,8 @@ def _find_visible(
 
 @parallel_jit
 def find_visible(
-    means: Any, quats: Any, log_scales: Any, logit_opacities: Any, pose: Any, view: View, roughly: bool,
-    visible: Any, depth: Any, workers: int,
+    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, pose: Array34, view: View,
+    roughly: bool, visible: ArrayN, depth: ArrayN, workers: int,
 ) -> None:  # fmt: skip
     """Write the visibility (N,) of N Gaussians, and the depth (N,) of the visible, on `workers` threads.
 
@@ -147,7 +152,9 @@ def find_visible(
 
 
 @jit
-def _write_splat(splats: Any, ellipses: Any, row: int, center: Any, cov: Any, log_opacity: float) -> None:
+def _write_splat(
+    splats: ArrayNK, ellipses: ArrayNK, row: int, center: Vector2, cov: Vector3, log_opacity: float
+) -> None:
     """Fill the rows for blending (without colour, depth and slope) and for binning.
 
     The conic is kept as the factor of ½ Σ⁻¹: the exponent is −(f_xx dx + f_xy dy)² − (f_yy dy)². This form does not
@@ -168,8 +175,9 @@ def _write_splat(splats: Any, ellipses: Any, row: int, center: Any, cov: Any, lo
 
 @worker_jit
 def _project_visible(
-    means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, splats: Any, ellipses: Any, normals: Any, worker: int, workers: int,
+    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, sh: ArrayNK3, pose: Array34,
+    center: ArrayN, view: View, degree: int, visible: ArrayN, splats: ArrayNK, ellipses: ArrayNK, normals: ArrayN3,
+    worker: int, workers: int,
 ) -> None:  # fmt: skip
     basis = np.empty(MAX_COEFFICIENTS)
     count = visible.shape[0]
@@ -197,8 +205,9 @@ def _project_visible(
 
 @parallel_jit
 def project_visible(
-    means: Any, quats: Any, log_scales: Any, logit_opacities: Any, sh: Any, pose: Any, center: Any, view: View,
-    degree: int, visible: Any, splats: Any, ellipses: Any, normals: Any, workers: int,
+    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, sh: ArrayNK3, pose: Array34,
+    center: ArrayN, view: View, degree: int, visible: ArrayN, splats: ArrayNK, ellipses: ArrayNK, normals: ArrayN3,
+    workers: int,
 ) -> None:  # fmt: skip
     """Fill the tables of the M visible Gaussians.
 
@@ -247,7 +256,7 @@ def _clamp_to_int(value: float, low: int, high: int) -> int:
 
 
 @jit
-def _column_span(ellipses: Any, splat: int, width: int) -> Any:
+def _column_span(ellipses: ArrayNK, splat: int, width: int) -> Any:
     """Return the first and last column of tiles; first > last if there is none."""
     x = float(ellipses[splat, E_X])
     extent = math.sqrt(float(ellipses[splat, E_LEVEL]) * float(ellipses[splat, E_XX]))
@@ -259,7 +268,7 @@ def _column_span(ellipses: Any, splat: int, width: int) -> Any:
 
 
 @jit
-def _row_span(ellipses: Any, splat: int, column: int, height: int) -> Any:
+def _row_span(ellipses: ArrayNK, splat: int, column: int, height: int) -> Any:
     """Return the first and last row of pixels that the ellipse touches within a column of tiles.
 
     At a distance dx from the centre the ellipse spans dx · xy/xx ± sqrt((level − dx²/xx) · det/xx). The upper
@@ -284,7 +293,7 @@ def _row_span(ellipses: Any, splat: int, column: int, height: int) -> Any:
 
 @worker_jit
 def _count_hits(
-    ellipses: Any, order: Any, width: int, height: int, per_tile: Any, per_splat: Any, run: int
+    ellipses: ArrayNK, order: ArrayN, width: int, height: int, per_tile: ArrayNK, per_splat: ArrayN, run: int
 ) -> None:
     splats = order.shape[0]
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
@@ -304,7 +313,9 @@ def _count_hits(
 
 
 @parallel_jit
-def count_hits(ellipses: Any, order: Any, width: int, height: int, per_tile: Any, per_splat: Any) -> None:
+def count_hits(
+    ellipses: ArrayNK, order: ArrayN, width: int, height: int, per_tile: ArrayNK, per_splat: ArrayN
+) -> None:
     """Count the tiles of splats (M, ELLIPSE_WIDTH), nearest first in `order` (M,), in an image of some pixels.
 
     Hits of each run in each tile (RUNS, tiles), and hits of each splat (M,), are written.
@@ -314,7 +325,7 @@ def count_hits(ellipses: Any, order: Any, width: int, height: int, per_tile: Any
 
 
 @kernel_jit
-def starts_from_counts(per_tile: Any, tile_start: Any) -> None:
+def starts_from_counts(per_tile: ArrayNK, tile_start: ArrayN) -> None:
     """Turn `per_tile` (RUNS, tiles) into the place of each run's first hit; fill `tile_start` (tiles + 1,)."""
     place = 0
     for tile in range(per_tile.shape[1]):
@@ -328,8 +339,8 @@ def starts_from_counts(per_tile: Any, tile_start: Any) -> None:
 
 @worker_jit
 def _list_hits(
-    ellipses: Any, order: Any, width: int, height: int, next_place: Any, splat_start: Any, hits: Any, places: Any,
-    run: int,
+    ellipses: ArrayNK, order: ArrayN, width: int, height: int, next_place: ArrayNK, splat_start: ArrayN,
+    hits: ArrayN, places: ArrayN, run: int,
 ) -> None:  # fmt: skip
     splats = order.shape[0]
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
@@ -352,7 +363,14 @@ def _list_hits(
 
 @parallel_jit
 def list_hits(
-    ellipses: Any, order: Any, width: int, height: int, next_place: Any, splat_start: Any, hits: Any, places: Any
+    ellipses: ArrayNK,
+    order: ArrayN,
+    width: int,
+    height: int,
+    next_place: ArrayNK,
+    splat_start: ArrayN,
+    hits: ArrayN,
+    places: ArrayN,
 ) -> None:
     """List the splats of each tile, nearest first, and the places of each splat in those lists.
 
