@@ -22,10 +22,10 @@ from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.statistics import mad_sigma
-from pipelines.survey.adjustment import GeolocatedPoints
 from pipelines.survey.area import ground_sampling_m
 from pipelines.survey.calibrated import load_survey
 from pipelines.survey.common_points import CommonPoints
+from pipelines.survey.solution import GeolocatedPoints
 from pipelines.survey.survey import Survey
 
 _SIDE = 4  # blocks along a side
