@@ -15,9 +15,10 @@ import pytest
 
 from pipelines.adjust.posterior import save_posterior
 from pipelines.core.errors import DegenerateGeometryError, InputError, MissingProductError
-from pipelines.core.products import save_json
+from pipelines.core.fingerprints import fingerprints
+from pipelines.core.products import load_json, save_json
 from pipelines.core.progress import SILENT
-from pipelines.core.stages import ADJUSTMENT, SIM3_POSTERIOR
+from pipelines.core.stages import ADJUSTMENT, BY_NAME, MODEL, SIM3_POSTERIOR
 from pipelines.formats.colmap import quiet_colmap, reconstruction_of
 from pipelines.geodesy.enu import Origin
 from pipelines.sfm.colmap_database import write_frame
@@ -25,10 +26,13 @@ from pipelines.sfm.dates import DATABASE, SolvedDate, pairs_across, tie_to_earli
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.learned_features import LearnedFeatures
 from pipelines.sfm.options import SfmOptions
-from pipelines.survey.common_points import CommonPoints
+from pipelines.survey.common_points import CommonPoints, solution_hash
+from pipelines.survey.solution import Solution, TrainedModel
 from pipelines.survey.survey import Survey, SurveyImage
+from tests.change_pairs import nudge_first_camera
 from tests.refusals import refused
 from tests.scenes import write_workspace
+from tests.trained_workspaces import trained_workspace
 from tests.two_dates import ASIDE, HERE, IMAGES, POINTS, Date, draw_date, ground
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -177,6 +181,26 @@ def test_another_place_is_refused_before_the_work(tmp_path: Path) -> None:
         SolvedDate.load(tmp_path / "spring", moved)
     assert caught.value.code == "earlier-apart"
     assert "3" in str(caught.value)  # three kilometres
+
+
+def test_only_cameras_elsewhere_ask_for_new_ties(tmp_path: Path) -> None:
+    """A training that keeps what `init-sim3` has solved leaves `sfm` of the later date current."""
+    _, spring = trained_workspace(tmp_path / "spring")
+    model = load_json(TrainedModel, spring.path(MODEL))
+    save_json(Solution(**{name: getattr(model, name) for name in Solution.model_fields}), spring.root / ADJUSTMENT)
+
+    def known() -> str:
+        return fingerprints(spring, BY_NAME["sfm"], SfmOptions(earlier=spring.root), {}).hashes["--earlier"]
+
+    trained, hashed = known(), solution_hash(spring)
+    assert trained == hashed
+    (spring.root / MODEL).unlink()
+    assert known() == trained
+    save_json(model.model_copy(update={"iterations": model.iterations + 1}), spring.root / MODEL)
+    assert known() == trained
+    nudge_first_camera(spring, 1)
+    assert known() != trained
+    assert solution_hash(spring) == known()
 
 
 def without_origin(root: Path, survey: Survey) -> Survey:
