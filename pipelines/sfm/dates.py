@@ -329,7 +329,7 @@ class _BothDates:
         pairs = self._pairs(job, _NEIGHBOURS)
         self._match(colmap, job, pairs, progress, loosely=False)
         yield "SIFT", self._ties(colmap, pairs)
-        more = self._pairs(job, 2 * _NEIGHBOURS)
+        more = sorted({*pairs, *self._pairs(job, 2 * _NEIGHBOURS)})
         with colmap.Database.open(self.path) as database:  # COLMAP matches no pair twice
             database.clear_matches()
             database.clear_two_view_geometries()
