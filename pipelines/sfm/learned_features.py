@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     import torch
 
 _LONGEST_PX = 1024  # of the photograph: what the networks have learned from
+_MOST_ENLARGED = 2.0  # of a smaller photograph, whose features are too few at its own size
 _MOST_FEATURES = 2048
 _LEAST_SCORE = 0.1  # of a match, LightGlue's own default
 _FEWEST_MATCHES = 15  # COLMAP's fewest inliers of a pair
@@ -43,7 +44,7 @@ _DESCRIPTOR = 128
 class LearnedFeatures:
     """Features of a photograph: places (N, 2) in pixels of a picture of `size_px`, and descriptors (N, 128).
 
-    The picture is the photograph of `photo_px`, reduced and turned by `quarters` to the left. `upright`: north is
+    The picture is the photograph of `photo_px`, resized and turned by `quarters` to the left. `upright`: north is
     up in it.
     """
 
@@ -100,10 +101,11 @@ class LearnedMatcher:
             nothing = np.zeros((0, 2), np.float32), np.zeros((0, _DESCRIPTOR), np.float32)
             return LearnedFeatures(*nothing, (1, 1), (1, 1), 0, upright=False)
         height, width = pixels.shape[:2]
-        scale = min(1.0, _LONGEST_PX / max(width, height))
-        small = cv2.resize(pixels, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
+        scale = min(_MOST_ENLARGED, _LONGEST_PX / max(width, height))
+        kernel = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+        resized = cv2.resize(pixels, (round(width * scale), round(height * scale)), interpolation=kernel)
         quarters = quarters_to_north(image)
-        turned = np.ascontiguousarray(np.rot90(small[..., ::-1], quarters or 0))
+        turned = np.ascontiguousarray(np.rot90(resized[..., ::-1], quarters or 0))
         picture = self._torch.from_numpy(turned).permute(2, 0, 1)[None].float() / 255
         with self._torch.inference_mode():
             (found,) = self._detector(picture)

@@ -37,6 +37,7 @@ _FITS_AS_WELL = 1.25  # reprojection error with the lens held, over that with it
 _ENOUGH_MATCHES = 100  # verified ones of a pair: learned features add little to these
 _MOST_NAMED = 5
 _MOST_LEARNED_PAIRS = 4000  # hours on two cores
+_NEIGHBOURS = 3  # of a photograph with learned features, by matches: with these it makes points of them
 
 
 @dataclass(frozen=True)
@@ -153,14 +154,24 @@ def _sound_lens(mapped: MappedModels, survey: Survey) -> dict[int, Any]:
 
 
 def _pairs_to_add(colmap: ModuleType, job: SfmJob, mapped: MappedModels) -> IntArray:
-    """Return the pairs (P, 2) that learned features may connect: of photographs apart, with few matches so far."""
+    """Return the pairs (P, 2) to match by learned features: those that may connect photographs apart come first.
+
+    A photograph joins a model by features that are points of it. The photographs of those pairs are therefore
+    matched with their neighbours too, although these have matches enough: these are of other features.
+    """
     apart = set(range(len(job.survey.images))) - {i - 1 for i in mapped.models[0].reg_image_ids()}
     matched = verified_matches(colmap, job.database)
     candidates = candidate_pairs(job.survey, job.options).tolist()
     wanted = [
         (a, b) for a, b in candidates if (a in apart or b in apart) and matched.get((a, b), 0) < _ENOUGH_MATCHES
     ]
-    return np.array(wanted, dtype=np.int64).reshape(-1, 2)
+    beside: dict[int, list[tuple[int, int]]] = {index: [] for pair in wanted for index in pair}
+    for pair in sorted(matched, key=lambda pair: (-matched[pair], pair)):
+        if matched[pair] >= _ENOUGH_MATCHES:
+            for index in set(pair) & set(beside):
+                beside[index].append(pair)
+    nearest = {pair for pairs in beside.values() for pair in pairs[:_NEIGHBOURS]}
+    return np.array([*wanted, *sorted(nearest)], dtype=np.int64).reshape(-1, 2)
 
 
 def _add_learned(colmap: ModuleType, job: SfmJob, pairs: IntArray, progress: Progress) -> int:

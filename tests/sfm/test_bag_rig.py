@@ -97,7 +97,7 @@ def info(flight: Circle, lens: BrownLens, topic: str, frame: str) -> Message:
 
 
 def test_the_cameras_of_a_bag_keep_their_places_at_each_instant(tmp_path: Path) -> None:
-    """From 42 m a pixel is 12 cm; some 800 places in a photograph tell its centre to a hundredth of that."""
+    """From 42 m a pixel is 12 cm; over 1000 tie points in a photograph tell its centre to a sixth of that."""
     flight, workspace = Circle(), Workspace(tmp_path / "ws")
     messages, center = recorded(flight)
     bag = bags.write(tmp_path / "bag", messages)

@@ -223,6 +223,61 @@ def test_added_features_make_a_model(tmp_path: Path) -> None:
     assert list(kept.params) == pytest.approx(list(job.survey.cameras[0].params))
 
 
+def test_features_that_connect_two_groups_become_points_within_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two groups have features of their own, and others in common that learned matches alone connect.
+
+    A photograph of the second group joins the model of the first if their common features are points of it, so if
+    these are matched within the first group, too.
+    """
+    truth = true_model(12)
+    ids = sorted(truth.reg_image_ids())
+    survey = surveyed(truth)
+    survey = survey.model_copy(
+        update={"images": tuple(one.model_copy(update={"fix": None}) for one in survey.images)}
+    )
+    job = SfmJob(survey, tmp_path, tmp_path / "database.db", SfmOptions(camera_model="SIMPLE_RADIAL", threads=1))
+    with pycolmap.Database.open(job.database):
+        pass
+    write_frame(pycolmap, job.database, survey, range(len(ids)), job.options)
+    place = [{one.point3D_id: one.xy for one in truth.images[key].points2D if one.has_point3D()} for key in ids]
+    everywhere = sorted(set.intersection(*(set(each) for each in place)))
+    own, common = everywhere[:-40], everywhere[-40:]
+    assert len(own) >= rounds._ENOUGH_MATCHES
+    rows = np.arange(len(own))[:, None].repeat(2, axis=1)
+    group = [range(6), range(6, 12)]
+    within = [(a, b) for each in group for a in each for b in each if a < b]
+    with pycolmap.Database.open(job.database) as database:
+        for index, each in enumerate(place):
+            at = np.array([[*each[point], 1.0, 0.0, 0.0, 1.0] for point in own], np.float32)
+            database.write_keypoints(index + 1, at)
+            nothing = np.zeros((len(own), 128), np.uint8)
+            kind = pycolmap.FeatureExtractorType.SIFT
+            database.write_descriptors(index + 1, pycolmap.FeatureDescriptors(kind, nothing))
+        for a, b in within:
+            database.write_matches(a + 1, b + 1, rows.astype(np.uint32))
+    verify_matches(pycolmap, job, np.array(within), SILENT)
+
+    def add_learned(colmap: Any, job: SfmJob, pairs: np.ndarray, progress: Any) -> int:
+        asked = [(a, b) for a, b in pairs.tolist()]
+        places = {i: np.array([place[i][point] for point in common]) for i in {i for pair in asked for i in pair}}
+        same = np.arange(len(common))[:, None].repeat(2, axis=1)
+        add_features(colmap, job.database, places, dict.fromkeys(asked, same))
+        verify_matches(colmap, job, pairs, progress)
+        return len(asked)
+
+    monkeypatch.setattr(rounds, "missing_for_learned", lambda: None)
+    monkeypatch.setattr("pipelines.sfm.learned_features.add_learned", add_learned)
+    assert map_database(pycolmap, job, SILENT)[0][0].num_reg_images() == len(group[0])
+    model = rounds.map_in_rounds(pycolmap, job, SILENT).models[0]
+    assert sorted(model.reg_image_ids()) == ids
+    solved = np.array([model.images[key].projection_center() for key in ids])
+    true = np.array([truth.images[key].projection_center() for key in ids])
+    # Without noise: the error is that of keypoints in float32, and of a lens that is solved.
+    assert np.abs(umeyama(solved, true).apply(solved) - true).max() < 1e-2
+
+
 def test_what_is_joined_is_told_with_the_size_of_each_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
