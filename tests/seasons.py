@@ -20,16 +20,16 @@ from tests.sfm_scenes import survey_of
 
 # Share of a surface that is under snow, where the drifts are of mean thickness. Walls stay bare.
 _SNOW = {
-    Material.TERRAIN: 0.75,
-    Material.TILES: 0.75,
-    Material.FLAT_ROOF: 0.85,
-    Material.PLAIN: 0.5,
-    Material.LEAVES: 0.35,
-    Material.CAR: 0.6,
-    Material.SOLAR: 0.5,
+    Material.TERRAIN: 0.5,
+    Material.TILES: 0.5,
+    Material.FLAT_ROOF: 0.57,
+    Material.PLAIN: 0.33,
+    Material.LEAVES: 0.23,
+    Material.CAR: 0.4,
+    Material.SOLAR: 0.33,
 }
 _DRIFTS_M = (5.0, 2.2, 1.0, 0.45, 0.2)
-_DRIFTED = 1.2  # of the share, for a drift of the largest thickness
+_DRIFTED = 0.9  # of the share, for a drift of the largest thickness
 _WHITE = np.array([0.66, 0.69, 0.74], dtype=np.float32)
 _TURNED_RAD, _LOW_RAD = 2.2, 0.45  # of the sun in winter: from that in summer, and above the horizon
 

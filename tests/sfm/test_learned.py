@@ -170,7 +170,7 @@ def seasons(tmp_path_factory: pytest.TempPathFactory) -> TwoSeasons:
     """From 60 m, where a pixel is 0.2 m; each photograph overlaps with some of both seasons."""
     pytest.importorskip("embreex")
     folder = tmp_path_factory.mktemp("seasons") / "photos"
-    options = FLIGHT.model_copy(update={"images": 10, "size": "360x270"})
+    options = FLIGHT.model_copy(update={"images": 8, "size": "360x270"})
     return TwoSeasons(folder, *photographed_in_two_seasons(options, folder))
 
 
