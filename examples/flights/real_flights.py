@@ -114,7 +114,7 @@ def run_flight(flight: Flight, data: Path, out: Path, preset: str) -> Run:
             f"{flight.name}: other photographs than those of the published figures ({found[:12]}…)", file=sys.stderr
         )
     out.mkdir(parents=True, exist_ok=True)
-    started, before = time.strftime("%Y-%m-%d"), record_of(workspace)
+    started, version, before = time.strftime("%Y-%m-%d"), described_version(), record_of(workspace)
     with (out / f"{flight.name}.log").open("w", encoding="utf-8") as log:
         process = subprocess.Popen([sys.executable, "-m", "georef_cli", *words], stdout=log, stderr=log, cwd=ROOT)
         _, status, usage = os.wait4(process.pid, 0)
@@ -122,7 +122,7 @@ def run_flight(flight: Flight, data: Path, out: Path, preset: str) -> Run:
     error = (
         "" if os.waitstatus_to_exitcode(status) == 0 else (re.findall(r"(?m)^error: .*", said) or [said[-300:]])[-1]
     )
-    run = Run(usage.ru_maxrss / 1024, error.removeprefix("error: "), started, described_version(), hardware())
+    run = Run(usage.ru_maxrss / 1024, error.removeprefix("error: "), started, version, hardware())
     if before is not None and not before.error and not run.error and run.peak_mb < before.peak_mb:
         return before  # Little was left to do.
     record_file(workspace).write_text(json.dumps(asdict(run)), encoding="utf-8")
