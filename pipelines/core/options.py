@@ -41,14 +41,13 @@ class InputMarker:
     """Mark of a path whose content decides the stage's result: its fingerprint enters the manifest.
 
     In a folder, files with the suffixes, in lower case, count; without any, all do. With `only`, the files at these
-    places in the folder count, as far as there are any; with `first`, of a workspace, the `fields` (`ProductPart`) of
-    the first of these products that it has. Files `beside` a file count with it: by its suffix, in lower case, patterns in its folder.
+    places in the folder count, as far as there are any; with `first`, of a workspace, the first of these products
+    that it has. Files `beside` a file count with it: by its suffix, in lower case, patterns in its folder.
     """
 
     suffixes: frozenset[str] = frozenset()
     only: frozenset[str] = frozenset()
-    first: tuple[str, ...] = ()
-    fields: tuple[str, ...] = ()
+    first: tuple[ProductPart, ...] = ()
     beside: tuple[tuple[str, tuple[str, ...]], ...] = ()
 
 
