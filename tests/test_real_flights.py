@@ -6,6 +6,7 @@ import argparse
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -94,3 +95,15 @@ def test_remarks_of_most_flights_are_said_once() -> None:
     first, second, third = {"a 1": "a", "b 1": "b"}, {"a 2": "a"}, {"c 3": "c", "a 3": "a"}
     assert real_flights.common_remarks([first, second, third]) == {"a"}
     assert real_flights.common_remarks([first, second]) == set()
+
+
+@pytest.mark.parametrize(
+    ("beside", "text"),
+    [
+        ({}, "30 of 43"),
+        ({"companions": 33, "companions_registered": 32}, "30 of 43, and 32 of 33 of the other lenses"),
+    ],
+)
+def test_the_lenses_of_a_rig_are_counted_apart(beside: dict[str, int], text: str) -> None:
+    sfm = SimpleNamespace(values={"registered": 30, "images": 43, **beside})
+    assert real_flights.registered(real_flights.Figures({"sfm": sfm}, None)) == text

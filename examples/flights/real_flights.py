@@ -197,8 +197,10 @@ def registered(figures: Figures) -> str:
     values = figures.manifests["sfm"].values if "sfm" in figures.manifests else None
     if not values:
         return "–"
-    lenses = f", and {values['companions_registered']} of {values['companions']} of the other lenses"
-    return f"{values['registered']} of {values['images']}{lenses if values.get('companions') else ''}"
+    of_rig = ""
+    if "companions" in values:
+        of_rig = f", and {values['companions_registered']} of {values['companions']} of the other lenses"
+    return f"{values['registered']} of {values['images']}{of_rig}"
 
 
 def accuracy(figures: Figures) -> str:
