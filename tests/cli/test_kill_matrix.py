@@ -54,13 +54,13 @@ def assert_tidy(workspace: Workspace) -> None:
 
 @pytest.mark.parametrize("stage", MATRIX)
 def test_a_stage(finished: Workspace, tmp_path: Path, stage: str) -> None:
-    """Killed without an older product, and while it made one anew with --force."""
+    """Killed twice without an older product, and as soon as it made one anew with --force."""
     workspace, spec = copied(finished, tmp_path), BY_NAME[stage]
     took_s = manifest_of(finished, spec).duration_s
     command = (*spec.command(workspace.root).split()[1:], *ONE_THREAD)
     first, middle, _ = moments(stage)
     kills = 0
-    for part, force in ((first, ()), (middle, ("--force",))):
+    for part, force in ((first, ()), (middle, ()), (0.0, ("--force",))):
         if not force:
             shutil.rmtree(workspace.root / spec.folder)
         kills += killed((*command, *force), workspace.partial(spec).exists, part * took_s)
