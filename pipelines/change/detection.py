@@ -8,7 +8,7 @@ height step is the place of a wall within its neighbourhood, common to the cells
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -265,7 +265,8 @@ def significant_change(cells: Cells, factor: float, reach: int) -> NDArray[np.in
 class Volume:
     """Sums over the cells of a region, from which its volumes follow: all in metres, before the cells' area.
 
-    `steps` is the variance of the sum that the places of walls and the interpolated parts leave.
+    `steps` is the variance of the sum that the places of walls and the interpolated parts leave; `missing` counts
+    cells without a height of both dates.
     """
 
     cells: int = 0
@@ -276,6 +277,7 @@ class Volume:
     steps: float = 0.0
     lowest: float = 0.0
     highest: float = 0.0
+    missing: int = field(default=0, kw_only=True)
 
     def __add__(self, other: Volume) -> Volume:
         return Volume(
@@ -287,6 +289,7 @@ class Volume:
             self.steps + other.steps,
             min(self.lowest, other.lowest),
             max(self.highest, other.highest),
+            missing=self.missing + other.missing,
         )
 
     def sigma_m3(self, noise: Noise, cell_m2: float, *, to_detect: bool = False) -> float:

@@ -9,7 +9,7 @@ errors, and that of the whole exceeds 1.96 σ.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +140,10 @@ def find_regions(
         for place, polygon in enumerate(given):
             of_polygon = cells_inside(polygon, grid.part(window)).astype(np.int64)
             of_given[place] += region_volumes(of_polygon, cells, 1)[0]
+    for place, polygon in enumerate(given):
+        cells_in_all = round(polygon.area / (grid.frame.step_x * grid.frame.step_y))
+        missing = max(cells_in_all - of_given[place].cells, 0)
+        of_given[place] = replace(of_given[place], missing=missing)
     polygons = list(given)
     net, sigma, net_of_core, sigma_of_core = (
         np.array(values)
@@ -237,4 +241,5 @@ def region_of(name: str, volume: Volume, noise: Noise, cell_m2: float) -> Change
         sigma_m3=volume.sigma_m3(noise, cell_m2),
         lowest_m=volume.lowest,
         highest_m=volume.highest,
+        known_share=volume.cells / max(volume.cells + volume.missing, 1),
     )

@@ -53,6 +53,7 @@ from pipelines.report.page import render_page
 from pipelines.survey.boundaries import Outlines, read_outlines
 from pipelines.survey.change_report import Change, ChangedRegion, EpochShift, RegionAtDate
 
+_MOSTLY_KNOWN = 0.95  # share of a given polygon with heights of both dates, below which a warning says so
 _PLACES = 20  # along each side of the rasters, which stand for the survey
 _ROOM = __name__.rpartition(".")[0]
 _MOST_LEVELS = 1_000_000  # of detection, whose median is stated
@@ -137,7 +138,8 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     remove(parts.folder)
     cautions = tuple(one.cautions for one in epochs)
     stale = tuple(remark for one in workspaces for remark in _stale_rasters(one))
-    warnings = (*stale, *twice, *solved_again, *left_out, *_doubted(change, found, doubtful, partly))
+    of_regions = (*_doubted(change, found, doubtful, partly), *_partly_known(found))
+    warnings = (*stale, *twice, *solved_again, *left_out, *of_regions)
     summary = _summary(change, warnings, union(*cautions))
     compared = Compared(stage.out, change, found.polygons, grid, workspaces, tied, doubtful.polygons)
     page = change_page(compared, summary.warnings, cautions, stage.progress)
@@ -349,6 +351,17 @@ def _doubted(change: Change, found: FoundRegions, doubtful: DoubtfulRegions, par
             "surfaces differ. Compare the photographs before you count the volume."
         )
         yield Remark(code="region-partly-contradicted", sentence=sentence)
+
+
+def _partly_known(found: FoundRegions) -> Iterator[Remark]:
+    """Yield the warning of given regions of which much has no height of one of the dates."""
+    few = [f"{one.name} ({one.known_share:.0%})" for one in found.regions if one.known_share < _MOSTLY_KNOWN]
+    if few:
+        sentence = (
+            f"The volumes of {listed(few)} are those of the part of the polygon that has a height of both dates. "
+            "The rest was not measured at one of them, and is counted as nothing."
+        )
+        yield Remark(code="region-partly-known", sentence=sentence)
 
 
 def _rows_by_date(change: Change) -> list[list[Any]]:

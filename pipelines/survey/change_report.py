@@ -55,7 +55,10 @@ class CommonDates(Product):
 
 
 class ChangedRegion(Product):
-    """Region by its name: R, found; P, of the user's polygons; with the σ of its net volume."""
+    """Region by its name: R, found; P, of the user's polygons; with the σ of its net volume.
+
+    Area, volumes and σ are those of the cells with a height of both dates: `known_share` of the polygon.
+    """
 
     name: str
     area_m2: float
@@ -65,6 +68,7 @@ class ChangedRegion(Product):
     sigma_m3: float
     lowest_m: float
     highest_m: float
+    known_share: float = 1.0
 
 
 class DoubtfulRegion(ChangedRegion):

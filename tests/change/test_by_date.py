@@ -8,6 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+import shapely
+from rasterio.warp import transform_bounds
 from rich.console import Console
 
 from georef_cli.tables import date_volumes
@@ -95,7 +98,26 @@ def test_a_pair_of_the_chain_says_the_same(
     for one, region in zip(whole.by_date[0].regions, given, strict=False):
         assert one.net_m3 == pytest.approx(region.net_m3, rel=1e-3)
         assert one.sigma_m3 == pytest.approx(region.sigma_m3, rel=0.02)
+        assert region.known_share > 0.95
     assert not part.by_date  # two dates are one comparison
+
+
+def test_a_polygon_beyond_the_rasters_says_what_part_counts(
+    chain: tuple[dict[str, Workspace], float], tmp_path: Path
+) -> None:
+    """Of a box twice as wide as the rasters one half has heights."""
+    dates, _ = chain
+    with rasterio.open(dates["spring"].root / "raster/dsm.tif") as dsm:
+        west, south, east, north = transform_bounds(dsm.crs, "EPSG:4326", *dsm.bounds)
+    box = shapely.box(west, south, 2 * east - west, north)
+    (tmp_path / "box.geojson").write_text(shapely.to_geojson(box), "utf-8")
+    (tmp_path / "out").mkdir()
+    options = ChangeOptions(before=dates["spring"].root, regions=tmp_path / "box.geojson")
+    summary = run(StageRun(dates["autumn"], tmp_path / "out"), options)
+    given = load_json(Change, tmp_path / "out/change.json").regions[0]
+    # The rasters' sides are not along meridians: their bounds are a little wider than they.
+    assert given.name == "P1" and 0.4 < given.known_share < 0.55
+    assert "region-partly-known" in {warning.code for warning in summary.warnings}
 
 
 def test_a_date_without_rasters_is_named(chain: tuple[dict[str, Workspace], float], tmp_path: Path) -> None:
