@@ -87,7 +87,7 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     height = mosaic.sample("dsm")
     if not len(height):
         message = f"No cell is seen by {options.min_views} training views or more."
-        remedy = "Lower --min-views."
+        remedy = "Train longer, or lower --min-views."
         raise DegenerateGeometryError("no-raster-cells", message, remedy=remedy)
     sidecar = _sidecar(stage, model, mosaic, source, height, options=options, no_sigma=reason)
     terrain = sidecar if source.terrain is None else _sidecar_of_terrain(sidecar, mosaic)

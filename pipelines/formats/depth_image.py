@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +86,10 @@ def _read_exr(path: Path) -> DepthImage:
         remedy = "Name it Z, or write it alone."
         raise InputError("depth-channels", message, path=path, remedy=remedy)
     try:
-        channels = _exr_channels(OpenEXR.File(str(path), separate_channels=True))
+        with redirect_stdout(StringIO()) as told:  # OpenEXR prints there what it cannot read, and leaves those rows
+            channels = _exr_channels(OpenEXR.File(str(path), separate_channels=True))
+        if told.getvalue():
+            raise ValueError(told.getvalue().strip())
         pixels = channels[chosen]
     except Exception as error:
         raise _damaged(path, error) from error

@@ -273,3 +273,14 @@ def test_any_bytes_give_depths_or_an_input_error(
         read_depth_image(path)
     except InputError as error:
         assert error.path == path
+
+
+def test_half_an_exr_is_damaged_and_nothing_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The library reads what is there, prints of the rest, and leaves it as it finds the memory."""
+    path = tmp_path / "a.exr"
+    write_exr(path, {"Z": np.random.default_rng(0).uniform(1, 9, (64, 64)).astype(np.float32)})
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match="damaged") as raised:
+        read_depth_image(path)
+    assert raised.value.path == path
+    assert capsys.readouterr().out == ""
