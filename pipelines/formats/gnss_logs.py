@@ -65,7 +65,7 @@ def read_mrk(path: Path) -> CameraEvents:
     Raises:
         InputError: no event, a line of another layout, a coordinate out of range, or one number twice.
 
-    Example:
+    Examples:
         >>> _ = Path("flight.MRK").write_text(
         ...     "1\t302418.500000\t[2312]\t-66,N\t10,E\t194,V\t46.80000000,Lat\t7.10000000,Lon\t512.000,Ellh\t"
         ...     "0.011, 0.012, 0.025\t50,Q\n"
@@ -275,7 +275,7 @@ def read_subtitles(path: Path) -> VideoPositions:
     Raises:
         InputError: no subtitle has a position, or a coordinate is out of range.
 
-    Example:
+    Examples:
         >>> _ = Path("video.SRT").write_text(
         ...     "1\n00:00:00,000 --> 00:00:00,033\n"
         ...     "[latitude: 46.8] [longitude: 7.1] [rel_alt: 50.0 abs_alt: 512.0]\n"

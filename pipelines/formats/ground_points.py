@@ -98,7 +98,7 @@ def read_geo(path: Path) -> PoseTable:
     Raises:
         InputError: no CRS line, no row, a wrong number of columns, or a cell that is no number.
 
-    Example:
+    Examples:
         >>> _ = Path("geo.txt").write_text("EPSG:32632\na.jpg 500000 5180000 512\n")
         >>> read_geo(Path("geo.txt")).names
         ('a.jpg',)
@@ -140,7 +140,7 @@ def read_ground_points(path: Path) -> GroundPoints:
         InputError: no CRS line, too few columns, a cell that is no number or NaN, no line at all, or one point at
             two places.
 
-    Example:
+    Examples:
         >>> _ = Path("gcp_list.txt").write_text("EPSG:32632\n500010 5180020 498.5 1210.5 733 a.jpg P1\n")
         >>> read_ground_points(Path("gcp_list.txt")).marks
         (ListedMark(line=2, name='P1', image='a.jpg', x_px=1210.5, y_px=733.0, sigma_px=None),)
@@ -181,7 +181,7 @@ def read_point_list(path: Path) -> GroundPoints:
         InputError: no row, a number of columns other than four, a cell that is no number, or one point at two
             places.
 
-    Example:
+    Examples:
         >>> _ = Path("points.txt").write_text("EPSG:32632\nP1 500010 5180020 498.5\n")
         >>> read_point_list(Path("points.txt")).points[0].xyz
         (500010.0, 5180020.0, 498.5)
@@ -273,7 +273,7 @@ def read_point_table(path: Path, *, projected: bool = False) -> GroundPoints:
     Raises:
         InputError: no rows, a column is missing, a cell is no number, or one point at two places.
 
-    Example:
+    Examples:
         >>> _ = Path("points.csv").write_text("label,x,y,z\nP1,500010,5180020,498.5\n")
         >>> read_point_table(Path("points.csv")).points[0].xyz
         (500010.0, 5180020.0, 498.5)
@@ -326,7 +326,7 @@ def _point_sigma_m(row: tables.Row) -> tuple[float | None, float | None]:
 def read_marks(path: Path) -> tuple[ListedMark, ...]:
     r"""Read marks of ground points; an InputError: no rows, a column is missing, or a cell is no number.
 
-    Example:
+    Examples:
         >>> _ = Path("marks.csv").write_text("image,label,x,y\na.jpg,P1,1210.5,733\n")
         >>> read_marks(Path("marks.csv"))[0].x_px
         1210.5
@@ -362,7 +362,7 @@ def read_distances(path: Path) -> tuple[ListedDistance, ...]:
         InputError: no rows, a column is missing, a distance or σ is not above zero, both ends are one point, a pair
             is listed twice, or a use is neither control nor check.
 
-    Example:
+    Examples:
         >>> _ = Path("bars.csv").write_text("from,to,distance,sigma\nA,B,1.2504,0.0002\n")
         >>> read_distances(Path("bars.csv"))
         (ListedDistance(line=2, ends=('A', 'B'), distance_m=1.2504, sigma_m=0.0002, is_check=False),)

@@ -52,7 +52,7 @@ def read_rig_config(path: Path) -> tuple[RigConfig, ...]:
         InputError: unreadable, not of that form, a rig without exactly one reference or with one lens, two lenses
             with one prefix, or a rotation that is none.
 
-    Example:
+    Examples:
         >>> import json
         >>> cameras = [{"image_prefix": "left/", "ref_sensor": True}, {"image_prefix": "right/"}]
         >>> _ = Path("rig.json").write_text(json.dumps([{"cameras": cameras}]))

@@ -112,7 +112,7 @@ def read_trajectory(path: Path, *, projected: bool = False) -> PoseTable:
         InputError: no usable header, no row, a cell that is no number, a value out of range, half a group of
             columns, or a row longer than the header. Names file, line and column.
 
-    Example:
+    Examples:
         >>> _ = Path("track.csv").write_text("image,latitude,longitude,altitude\na.jpg,46.8,7.1,512\n")
         >>> read_trajectory(Path("track.csv")).xyz.tolist()
         [[7.1, 46.8, 512.0]]

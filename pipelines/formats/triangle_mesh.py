@@ -189,7 +189,7 @@ def _ascii_faces(lines: list[bytes], count: int, columns: list[_Column], path: P
 def read_obj(path: Path) -> TriangleMesh:
     r"""Return the triangles of an OBJ; an InputError: too large, no faces, or a line that is none of OBJ.
 
-    Example:
+    Examples:
         >>> _ = Path("one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
         >>> len(read_obj(Path("one.obj")).faces)
         1
