@@ -112,10 +112,10 @@ def test_stopped_by_the_user_and_resumed(survey: Path, whole: Workspace) -> None
     assert [json.loads(row)["iteration"] for row in rows] == list(range(10, 101, 10))
 
 
-def test_thirty_kills_at_random(survey: Path, whole: Workspace) -> None:
+def test_sixteen_kills_at_random(survey: Path, whole: Workspace) -> None:
     workspace = Workspace(survey.parent / "soak")
     rng = np.random.default_rng(7)
-    for kill in range(30):
+    for kill in range(16):
         force = ("--force",) if kill % 5 == 4 else ()
         process = start("run", workspace.root, *asked(survey), *force, code=GEOREF)
         try:

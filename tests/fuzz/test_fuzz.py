@@ -21,7 +21,7 @@ pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time are those of Linux"),
 ]
 
-CASES, SLOW_CASES = 200, 10
+CASES, SLOW_CASES = 120, 10
 
 
 @pytest.fixture(scope="module")
