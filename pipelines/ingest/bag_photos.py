@@ -7,7 +7,7 @@ other cameras accompany them, as in a folder (`rig_instants`): stamps tell who w
 
 import re
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, FloatArray, IntArray
-from pipelines.formats.bag import BadImageError, Bag, ImageWriter, RawMessage, RosMessage, UndecodableError
+from pipelines.formats.bag import BadImageError, Bag, ImageWriter, RosMessage, UndecodableError
 from pipelines.formats.exif import PhotoTags
 from pipelines.formats.image_file import MAX_PIXELS, ImageFile, inspect_image
 from pipelines.geometry.rotations import log_so3, quat_xyzw_from_matrix
@@ -49,36 +49,30 @@ def write_photos(
     with the number of each one's message.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    writer, topic, count = ImageWriter(), images.topic, len(images.time_s)
     photos: list[Photo] = []
     numbers: list[int] = []
-    failed: list[str] = []
     recent: deque[float] = deque(maxlen=_NEIGHBOURS)
     blurred, hashes, copies = 0, set(), 0
-    with progress.task("photographs", count) as task:
-        for number, message in enumerate(bag.messages([topic])):
-            task.advance()
-            if number >= count or not images.usable[number]:
-                continue
-            last = numbers[-1] if numbers else None
-            if options.every is not None and not _is_due(options.every, images.time_s, place, last, number):
-                continue
-            picture = _picture(writer, bag, message, number)
-            if isinstance(picture, str):
-                failed.append(picture)
-                continue
-            name, data, file = picture
-            if options.skip_blurred and _is_blurred(file.sharpness, recent):
-                blurred += 1
-                continue
-            if file.sha256 in hashes:
-                copies += 1
-                continue
-            hashes.add(file.sha256)
-            (folder / name).write_bytes(data)
-            photos.append(Photo(name, file, PhotoTags(timestamp_s=float(images.time_s[number]))))
-            numbers.append(number)
-    _note_pictures(topic, failed, writer, remarks)
+
+    def wanted(number: int) -> bool:
+        if number >= len(images.time_s) or not images.usable[number]:
+            return False
+        last = numbers[-1] if numbers else None
+        return options.every is None or _is_due(options.every, images.time_s, place, last, number)
+
+    for number, name, data, file in _pictures(
+        bag, images, wanted, task_name="photographs", remarks=remarks, progress=progress
+    ):
+        if options.skip_blurred and _is_blurred(file.sharpness, recent):
+            blurred += 1
+            continue
+        if file.sha256 in hashes:
+            copies += 1
+            continue
+        hashes.add(file.sha256)
+        (folder / name).write_bytes(data)
+        photos.append(Photo(name, file, PhotoTags(timestamp_s=float(images.time_s[number]))))
+        numbers.append(number)
     if blurred:
         remarks.warn(
             "blurred-frames", f"{blurred} frames are blurred and are left out.", "--skip-blurred drops them."
@@ -103,39 +97,48 @@ def write_messages(
     Returned are the photographs, each with its number.
     """
     (folder / within).mkdir(parents=True, exist_ok=True)
-    writer, photos, failed = ImageWriter(), [], []
-    with progress.task(f"photographs, {within}", len(images.time_s)) as task:
-        for number, message in enumerate(bag.messages([images.topic])):
-            task.advance()
-            if number not in numbers:
-                continue
-            picture = _picture(writer, bag, message, number)
-            if isinstance(picture, str):
-                failed.append(picture)
-                continue
-            name, data, file = picture
-            (folder / within / name).write_bytes(data)
-            tags = PhotoTags(timestamp_s=float(images.time_s[number]))
-            photos.append((Photo(f"{within}/{name}", file, tags), number))
-    _note_pictures(images.topic, failed, writer, remarks)
+    photos = []
+    task_name = f"photographs, {within}"
+    for number, name, data, file in _pictures(
+        bag, images, numbers.__contains__, task_name=task_name, remarks=remarks, progress=progress
+    ):
+        (folder / within / name).write_bytes(data)
+        tags = PhotoTags(timestamp_s=float(images.time_s[number]))
+        photos.append((Photo(f"{within}/{name}", file, tags), number))
     return photos
 
 
-def _picture(writer: ImageWriter, bag: Bag, message: RawMessage, number: int) -> tuple[str, bytes, ImageFile] | str:
-    """Return name, bytes and head of the file of a message, or the reason why it is none."""
-    try:
-        data, suffix = writer.encoded(message.type, bag.decode(message))
-        name = f"frame_{number:06d}{suffix}"
-        return name, data, inspect_image(data, Path(name))
-    except (UndecodableError, BadImageError, InputError) as error:
-        return f"message {number} ({str(error)[:120]})"
+def _pictures(
+    bag: Bag,
+    images: TopicSamples,
+    wanted: Callable[[int], bool],
+    *,
+    task_name: str,
+    remarks: Remarks,
+    progress: Progress,
+) -> Iterator[tuple[int, str, bytes, ImageFile]]:
+    """Yield number, file name, bytes and head of the pictures of a topic, and say which could not be read.
 
-
-def _note_pictures(topic: str, failed: Sequence[str], writer: ImageWriter, remarks: Remarks) -> None:
-    remarks.warn_counted("image-unreadable", failed, f"Images of {topic} cannot be read and are left out")
+    `wanted` is asked for each message by its number, after the pictures before it were used.
+    """
+    writer, failed = ImageWriter(), []
+    with progress.task(task_name, len(images.time_s)) as task:
+        for number, message in enumerate(bag.messages([images.topic])):
+            task.advance()
+            if not wanted(number):
+                continue
+            try:
+                data, suffix = writer.encoded(message.type, bag.decode(message))
+                name = f"frame_{number:06d}{suffix}"
+                file = inspect_image(data, Path(name))
+            except (UndecodableError, BadImageError, InputError) as error:
+                failed.append(f"message {number} ({str(error)[:120]})")
+            else:
+                yield number, name, data, file
+    remarks.warn_counted("image-unreadable", failed, f"Images of {images.topic} cannot be read and are left out")
     if writer.bits is not None:
         remarks.assume(
-            "image-bit-depth", f"16-bit images of {topic} use {writer.bits} bits, as the first one does."
+            "image-bit-depth", f"16-bit images of {images.topic} use {writer.bits} bits, as the first one does."
         )
 
 
