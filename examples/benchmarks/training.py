@@ -5,7 +5,8 @@ backward, optimiser, density statistics) against Gaussians and pixels, over the 
 trains on a workspace with each strategy and limit of Gaussians, and prints PSNR of training views (exposures
 applied) and test views against time; the time that measuring takes does not count. `georeference` trains with each
 way of holding to the georeference and several seeds, and prints test PSNR, errors of check points, and how far the
-cameras have moved from the adjustment.
+cameras have moved from the adjustment. `presets` trains with each preset, and compares them at one size of picture:
+each preset's own test PSNR is of photographs of its own size, and small ones are easier.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from pipelines.adjust.solution import posterior_of
 from pipelines.core.stages import POINTS
 from pipelines.core.types import IntArray
 from pipelines.core.workspace import Workspace
+from pipelines.evaluate.photometric import TrainingCoverage
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.densify import DefaultSettings, DefaultStrategy
 from pipelines.splat.losses import photometric_loss
@@ -42,6 +44,7 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
+from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import mark_rays, triangulated_points
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import Scene, load_adjusted_scene, photographs
@@ -51,6 +54,7 @@ from pipelines.train.georeference.problem import frozen_problem, refining_proble
 from pipelines.train.initial_gaussians import TrainingScene
 from pipelines.train.options import TrainOptions
 from pipelines.train.solution_state import measured_problem, solved_at
+from pipelines.train.stage import trained_model
 from pipelines.train.surface import SceneSurface
 from pipelines.train.trainer import JointTrainer, make_trainer
 
@@ -173,6 +177,8 @@ class ViewQuality:
     trainer: JointTrainer
     images: ImageCache
     look: Path | None = None
+    judged_px: int | None = None  # longest side to which both are reduced first; None: as trained
+    coverage: TrainingCoverage | None = None  # pixels of ground that two training views show count alone
 
     @torch.no_grad()
     def psnr(self, views: IntArray) -> float:
@@ -191,7 +197,47 @@ class ViewQuality:
             self.look.mkdir(parents=True, exist_ok=True)
             pair = torch.cat([photo, colour], dim=1).mul(255).round().byte().numpy()
             cv2.imwrite(str(self.look / f"{index:04d}.png"), pair[..., ::-1])
-        return psnr(colour, photo, torch.from_numpy(np.array(self.images.mask(index))))
+        mask = torch.from_numpy(np.array(self.images.mask(index)))
+        covered = None if self.coverage is None else self.coverage.covered(index)
+        mask = mask if covered is None else mask & covered
+        if self.judged_px is not None:
+            colour, photo, mask = (reduced(image, self.judged_px) for image in (colour, photo, mask))
+        return psnr(colour, photo, mask)
+
+
+def reduced(image: torch.Tensor, longest_px: int) -> torch.Tensor:
+    """Return means over areas of an image (H, W, …), or the pixels of a mask (H, W) without a hole."""
+    height, width = image.shape[:2]
+    size = [max(1, round(side * longest_px / max(width, height))) for side in (width, height)]
+    mean = cv2.resize(image.float().numpy(), size, interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(mean > 0.999 if image.dtype == torch.bool else mean)
+
+
+def presets(arguments: argparse.Namespace) -> None:
+    """Print PSNR of the test views after a training with each preset and seed: at its own size, and at one size."""
+    heads = "  ".join(f"at {px:3d} px" for px in sorted(arguments.at))
+    print(f"preset    seed  seconds  gaussians  own px  own PSNR dB  {heads}")
+    for preset, seed in product(arguments.presets, arguments.seeds):
+        options = TrainOptions.model_validate({"preset": preset, "seed": seed, "backend": arguments.backend})
+        start = now(arguments.backend)
+        trainer, scene, images = trainer_on(arguments.workspace, options)
+        while trainer.iteration < trainer.options.iterations:
+            trainer.step()
+        taken, solution = now(arguments.backend) - start, load_adjusted_scene(Workspace(arguments.workspace))[0]
+        renderer = ModelRenderer(
+            *(trained_model(trainer, solution), scene.sparse, trainer.optimizer.gaussians.detached()),
+            *(images, trainer.rasterizer),
+        )
+        coverage = TrainingCoverage(renderer)
+        sizes = [px for px in sorted(arguments.at) if px <= images.max_size_px]
+        views = [ViewQuality(trainer, images, None, px, coverage) for px in (None, *sizes)]
+        own, *quality = [view.psnr(scene.test) for view in views]
+        judged = "  ".join(f"{one:9.2f}" for one in quality)
+        print(
+            f"{preset:8s} {seed:5d} {taken:8.0f} {len(trainer.optimizer.gaussians):10d} {images.max_size_px:7d}"
+            f" {own:12.2f}  {judged}",
+            flush=True,
+        )
 
 
 FIGURES = ("PSNR dB", "H mm", "V mm", "moved mm", "most mm", "whole mm", "surplus")
@@ -283,6 +329,12 @@ def main() -> None:
     held.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     held.add_argument("--iterations", type=int, default=200)
     held.set_defaults(run=georeference)
+    effort = modes.add_parser("presets", help="quality of each preset at one size of picture")
+    effort.add_argument("workspace", type=Path, help="with init-sim3 done")
+    effort.add_argument("--presets", nargs="+", default=["smoke", "fast", "standard", "high"])
+    effort.add_argument("--seeds", type=int, nargs="+", default=[0])
+    effort.add_argument("--at", type=int, nargs="+", default=[320, 800], help="longest sides in pixels")
+    effort.set_defaults(run=presets)
     arguments = parser.parse_args()
     arguments.run(arguments)
 
