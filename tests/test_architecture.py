@@ -342,6 +342,27 @@ def test_a_solution_is_one_type() -> None:
     assert {path: names for path, names in again.items() if names} == {}
 
 
+def classes_in(tree: ast.Module) -> dict[str, ast.ClassDef]:
+    """All classes of a module by name."""
+    return {node.name: node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+
+
+def measured_again(kinds: set[str], tree: ast.Module) -> set[str]:
+    """Which classes of a module are called after a kind of measurement, such as `TensorFixes`."""
+    return {name for name in classes_in(tree) if name.endswith(tuple(kinds))}
+
+
+def test_training_measures_nothing_a_second_time() -> None:
+    """A measurement is a term of the adjustment: training is held to it by the normal matrix."""
+    terms = classes_in(sources()["pipelines.adjust.terms"])
+    kinds = {name for name, node in terms.items() if any(dotted(base).endswith("Term") for base in node.bases)}
+    assert {"Fixes", "ControlPoints", "Attitudes", "Distances"} < kinds
+    assert measured_again(kinds, ast.parse("class TensorFixes: ...")) == {"TensorFixes"}
+    training = {module: tree for module, tree in sources().items() if inside(module, "pipelines.train")}
+    again = {module: measured_again(kinds, tree) for module, tree in training.items()}
+    assert {module: names for module, names in again.items() if names} == {}
+
+
 # Names by which the adjustment is solved. Others read the solution that it has stored.
 SOLVERS = {"minimise", "linearised", "problem_of", "SparseCholesky"}
 # The baseline of the comparison adjusts on its own.

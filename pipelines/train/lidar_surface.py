@@ -174,7 +174,7 @@ _RIM_PX = 2  # around a pixel: nearer surface of stereo there may hide the point
 _SAME = 0.01  # of the depth
 
 
-class LidarPlanes:
+class TrustedLidar:
     """Planes of the registered LiDAR that is trusted, of P points with a confidence (P,)."""
 
     def __init__(self, cloud: LidarCloud, confidence: FloatArray, pixel_m: float) -> None:
@@ -229,7 +229,7 @@ class FusedSurface(SceneSurface):
     ) -> None:
         super().__init__(maps)
         self._loss, self._free, self._pixel_m = loss, free, pixel_m
-        self.planes = LidarPlanes(cloud, judged.confidence, pixel_m)
+        self.planes = TrustedLidar(cloud, judged.confidence, pixel_m)
         # All points hide what lies behind them, those that training does not trust too, but none that are gone.
         standing = np.flatnonzero(~judged.rejected)
         self._cloud, self._confidence = rows_of(cloud, standing), judged.confidence[standing]

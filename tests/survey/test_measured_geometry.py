@@ -26,7 +26,7 @@ from pipelines.surface.lidar_cloud import LidarCloud, planes_of
 from pipelines.surface.measured_cloud import CloudReader, Thinning, read_thinned
 from pipelines.surface.registration import registration
 from pipelines.survey.options import CloudCrs, UpAxis
-from pipelines.train.lidar_surface import LidarPlanes, verdict
+from pipelines.train.lidar_surface import TrustedLidar, verdict
 from tests.geometry_files import ScanFile, distance_to, mesh_of, write_e57
 from tests.refusals import codes, numbers, refused
 from tests.survey.test_measured_cloud import ORIGIN, UTM, all_points, in_crs, town
@@ -382,5 +382,5 @@ def test_scans_and_meshes_are_registered_judged_and_followed_as_lidar_is(tmp_pat
     assert judged.rejected[away].mean() < 0.01
     # Stereo 0.1 m in front of a wall is brought onto it.
     wall = np.column_stack([np.full(60, -1.9), np.linspace(-8, 0, 60), np.linspace(2, 7, 60)])
-    moved, _, confidence = LidarPlanes(cloud, judged.confidence, PIXEL_M).onto(wall)
+    moved, _, confidence = TrustedLidar(cloud, judged.confidence, PIXEL_M).onto(wall)
     assert (confidence > 0).mean() > 0.9 and np.median(np.abs(moved[:, 0] + 2.0)) < 0.02

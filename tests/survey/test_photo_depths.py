@@ -23,7 +23,7 @@ from pipelines.surface.measured_cloud import Thinning, read_thinned
 from pipelines.surface.photo_depths import Along, DepthStatement, PhotoDepths, holds_depth_maps
 from pipelines.surface.registration import registration
 from pipelines.survey.scene import Scene
-from pipelines.train.lidar_surface import LidarPlanes, verdict
+from pipelines.train.lidar_surface import TrustedLidar, verdict
 from pipelines.train.options import LidarOptions
 from tests.geometry_files import write_exr
 from tests.refusals import codes, numbers, refused
@@ -157,7 +157,7 @@ def test_depth_maps_are_registered_judged_and_followed_as_lidar_is(tmp_path: Pat
     assert judged.rejected[away].mean() < 0.01
     # Stereo 0.1 m in front of a wall is brought onto it.
     wall = np.column_stack([np.full(60, -1.9), np.linspace(-8, 0, 60), np.linspace(2, 7, 60)])
-    moved, _, confidence = LidarPlanes(cloud, judged.confidence, PIXEL_M).onto(wall)
+    moved, _, confidence = TrustedLidar(cloud, judged.confidence, PIXEL_M).onto(wall)
     assert (confidence > 0).mean() > 0.8 and np.median(np.abs(moved[:, 0] + 2.0)) < 0.02
 
 

@@ -15,7 +15,7 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.surface.lidar_cloud import planes_of
 from pipelines.surface.registration import registration
 from pipelines.train.lidar import plane_observations, registration_of
-from pipelines.train.lidar_surface import LidarPlanes, _areas, verdict
+from pipelines.train.lidar_surface import TrustedLidar, _areas, verdict
 from tests.refusals import refused
 from tests.towns import EXTRA, PIXEL_M, SIGMA_M, TOWN, WITH_EXTRA, Town, scanned, surface_of, views_of
 
@@ -116,7 +116,7 @@ def test_planes_agree_with_the_shift_that_was_found() -> None:
 
 def test_surface_takes_the_planes_of_trusted_lidar() -> None:
     cloud = scanned(TOWN)
-    surface = LidarPlanes(cloud, np.full(len(cloud), 0.9), PIXEL_M)
+    surface = TrustedLidar(cloud, np.full(len(cloud), 0.9), PIXEL_M)
     on_roof = np.column_stack([np.random.default_rng(0).uniform(-13, -3, (50, 2)) * [1, 0.8], np.full(50, 8.4)])
     far = on_roof + np.array([0.0, 0.0, 5.0])
     points, normal, confidence = surface.onto(np.concatenate([on_roof, far]))
