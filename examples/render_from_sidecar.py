@@ -25,7 +25,7 @@ from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.splat.gaussians import read_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.photographs import Pinholes
 from pipelines.survey.scene import photographs
 from pipelines.survey.solution import Solution, read_sfm, read_trained

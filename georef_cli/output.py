@@ -229,7 +229,7 @@ def evaluated_cameras(workspace: Workspace, *, with_area: bool = True) -> Evalua
     from pipelines.adjust.solution import posterior_of
     from pipelines.evaluate.options import EvaluateOptions
     from pipelines.evaluate.stage import area_of_interest, evaluate
-    from pipelines.survey.calibrated import load_survey
+    from pipelines.survey.navigation import load_survey
     from pipelines.survey.solution import read_sfm, read_solution
 
     try:

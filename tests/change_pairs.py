@@ -22,8 +22,8 @@ from pipelines.formats.georef_sidecar import sidecar_path
 from pipelines.formats.geotiff import Band, RasterFrame, RasterKind, write_mosaic, write_part
 from pipelines.geodesy.vertical import parse_vertical
 from pipelines.survey.area import corners, scene_points
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.common_points import CommonPoints, solution_hash
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.solution import TrainedModel, read_sfm, read_solution
 from pipelines.survey.target_crs import target_crs

@@ -22,7 +22,7 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.initialise import gaussians_of_size
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.scene import Scene
 from pipelines.survey.solution import Solution, TrainedModel, read_solution
 from tests.once import fill_folder

@@ -16,7 +16,7 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.scene import photographs
 from pipelines.survey.solution import read_sfm, read_trained
 from tests.scenes import GEO_FROM_LOCAL, trained_cameras, trained_model

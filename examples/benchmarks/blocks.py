@@ -29,7 +29,7 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.surface.surface_views import model_renderer
 from pipelines.survey.block_plan import BlockCell, BlockRecord
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.report import read_report
 from pipelines.survey.solution import read_sfm, read_trained
 

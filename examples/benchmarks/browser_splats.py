@@ -24,7 +24,7 @@ from pipelines.formats.spz import write_spz
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians, transformed
 from pipelines.surface.surface_views import model_renderer
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.view.pictures import Painter, Photographs, ViewerCamera, Wanted, frame_of
 from tests.browser.chromium import chromium, served

@@ -34,8 +34,8 @@ from pipelines.splat.rasterizer.api import ALPHA_MAX, ALPHA_MIN, RasterSettings
 from pipelines.splat.rasterizer.reference import project_gaussians
 from pipelines.surface.picking import depth_around
 from pipelines.surface.surface_views import ModelRenderer, model_renderer
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import MarkRays, mark_rays
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.report import read_report
 from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.survey.survey import SurveyedPoint

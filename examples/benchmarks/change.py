@@ -39,8 +39,8 @@ from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.simulate.stage import TRUE_HEIGHTS, TRUTH
 from pipelines.simulate.truth import TrueChange, Truth
 from pipelines.survey.area import ground_sampling_m
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.change_report import Change
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_trained
 
 EPOCHS: dict[str, Sequence[str]] = {

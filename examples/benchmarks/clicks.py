@@ -31,7 +31,7 @@ from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import fly_survey
 from pipelines.surface.picking import Sight, SurfacePoint
 from pipelines.surface.surface_views import model_renderer
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.view.measuring import Fineness, MeasuringModel, WantedBase

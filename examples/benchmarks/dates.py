@@ -23,8 +23,8 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.statistics import mad_sigma
 from pipelines.survey.area import ground_sampling_m
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.common_points import CommonPoints
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import GeolocatedPoints
 from pipelines.survey.survey import Survey
 

@@ -47,7 +47,7 @@ from pipelines.simulate.truth import Truth
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.surface_views import model_renderer
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.report import read_report
 from pipelines.survey.scene import load_adjusted_scene, photographs

@@ -22,7 +22,7 @@ from pipelines.splat.exposure import with_affine
 from pipelines.splat.metrics import psnr
 from pipelines.surface.photometry import photograph_and_mask
 from pipelines.surface.surface_views import model_renderer
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_trained
 
 _SHRINKS = (1, 2, 4, 8)

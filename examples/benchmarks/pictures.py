@@ -39,8 +39,8 @@ from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.surface_views import model_renderer
 from pipelines.survey.area import corners, scene_points
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.photographs import Pinholes
 from pipelines.survey.scene import photographs

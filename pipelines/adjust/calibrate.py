@@ -2,7 +2,7 @@
 
 Reads `ingest/survey.json`, `sfm/sparse`, and `ingest/track.npz` if the navigation was recorded by time; positions
 by photograph are tested for a lag instead. Writes `calibrate/rig.json`. Its applied estimates change positions and
-attitudes when later stages read the survey (`survey.calibrated.load_survey`). The SfM model stays as it is.
+attitudes when later stages read the survey (`survey.navigation.load_survey`). The SfM model stays as it is.
 
 Boresight and lever arm are unknowns of the adjustment. It needs a start: an arm of a metre would make outliers of
 most positions of an RTK receiver. Here they are free so that their errors do not become a time offset.
@@ -25,7 +25,7 @@ from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.rotations import log_so3
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.calibrated import (
+from pipelines.survey.navigation import (
     FIX_LAG,
     FIX_LAG_OPEN,
     NavigationTrack,

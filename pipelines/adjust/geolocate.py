@@ -28,7 +28,7 @@ from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.intersection import CommonRotation, Intersections, Rays, UncertainCameras, intersect_rays
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import GeolocatedPoints
 from pipelines.survey.survey import Survey
 

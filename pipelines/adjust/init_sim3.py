@@ -65,8 +65,8 @@ from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.similarity import Similarity, SimilarityRecord, jacobian_at, spread_ratio_similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import ResidualStats, residual_stats, squared_mahalanobis
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.scene import Scene, initial_scene
 from pipelines.survey.solution import GeolocatedPoints, MeasurementVerdict, SimilarityEstimate, Solution
 from pipelines.survey.survey import MountParameter, Survey

@@ -23,7 +23,7 @@ from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_solution
 from pipelines.survey.survey import FixSession, Survey
 

@@ -20,7 +20,7 @@ from pipelines.geodesy.enu import Origin, ecef_from_enu_rotation, ecef_from_lla,
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.surface_views import ModelRenderer, model_renderer
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_trained
 
 _RENDER_PX = 960

@@ -44,7 +44,7 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.floaters import MeasuredView, before_surface, isolated
 from pipelines.surface.photometry import mean_psnr
 from pipelines.surface.surface_views import ModelRenderer, model_renderer
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.photographs import save_array
 from pipelines.survey.scene import load_adjusted_scene, photographs
 from pipelines.survey.solution import Solution, read_sfm, read_trained

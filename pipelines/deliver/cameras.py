@@ -45,8 +45,8 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.gaussians import read_gaussians
 from pipelines.survey.area import LEAST_RAYS, without_outliers
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.photographs import undistorted_name, write_undistorted
 from pipelines.survey.scene import network_of, photograph_files
 from pipelines.survey.solution import Solution, TrainedModel, read_sfm, read_solution

@@ -32,8 +32,8 @@ from pipelines.surface.ground import GroundModel
 from pipelines.surface.measured_area import area_of
 from pipelines.surface.surface_views import model_renderer
 from pipelines.survey.area import corners, scene_points
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.survey.target_crs import TargetCrs, target_crs
 

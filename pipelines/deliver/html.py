@@ -34,7 +34,7 @@ from pipelines.splat.metrics import psnr
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.sh import coefficient_count
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_solution
 
 _RESERVED_BYTES = 4000  # for what the page says of the loss

@@ -50,8 +50,8 @@ from pipelines.splat.surface import surface_discs
 from pipelines.surface.crop import crop_of
 from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_settings, pixel_on_surface_m
 from pipelines.surface.surface_views import ModelRenderer, SurfaceView, SurfaceViews, model_renderer
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_trained
 
 log = logging.getLogger(__name__)

@@ -44,8 +44,8 @@ from pipelines.surface.poisson import MeasuredPoints, closed_gap_m, poisson_mesh
 from pipelines.surface.surface_views import SurfaceViews, model_renderer
 from pipelines.surface.texture import TexturedMesh, photographed_colours, textured
 from pipelines.survey.area import Area
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.survey.target_crs import target_crs
 

@@ -49,8 +49,8 @@ from pipelines.splat.gaussians import transformed, write_gaussians
 from pipelines.surface.fusion import fusion_settings
 from pipelines.surface.measured_area import area_of
 from pipelines.surface.surface_views import model_renderer
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.scene import network_of
 from pipelines.survey.solution import Solution, read_sfm, read_solution, read_trained

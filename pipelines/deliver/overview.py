@@ -22,8 +22,8 @@ from pipelines.deliver.placement import solved_placement
 from pipelines.formats.splat_ply import read_centres
 from pipelines.formats.vector_files import Json, feature, polygon
 from pipelines.geodesy.enu import lla_from_enu
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CrsOptions
 from pipelines.survey.report import read_report
 from pipelines.survey.solution import read_trained

@@ -35,8 +35,8 @@ from pipelines.geometry.relief import pale, sunlight
 from pipelines.surface.measured_area import area_of
 from pipelines.surface.surface_views import ModelRenderer, model_renderer
 from pipelines.survey.area import corners, ground_sampling_m, scene_points
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.scene import photographs
 from pipelines.survey.solution import TrainedModel, read_sfm, read_trained
 from pipelines.survey.survey import Survey

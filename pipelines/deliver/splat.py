@@ -28,8 +28,8 @@ from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.sh import coefficient_count
 from pipelines.surface.crop import Crop, crop_of
 from pipelines.survey.block_plan import BlockRecord
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline_of
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CropOptions
 from pipelines.survey.solution import TrainedModel, read_trained
 

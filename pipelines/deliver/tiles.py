@@ -36,7 +36,7 @@ from pipelines.formats.spz import decode_spz, encode_wide_spz
 from pipelines.formats.tiles_archive import write_tiles_archive
 from pipelines.splat.level_of_detail import DetailTile, Tiler, best_cut, build_tiles, scene_box, within_budget
 from pipelines.splat.sh import coefficient_count
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.target_crs import target_crs, without_grid
 
 log = logging.getLogger(__name__)

@@ -56,10 +56,10 @@ from pipelines.surface.measured_area import area_of
 from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.surface_views import ModelRenderer, model_renderer
 from pipelines.survey.area import Area
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.headline import headline
 from pipelines.survey.held_out import HeldOutPoints
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CloudCrs, CrsOptions
 from pipelines.survey.photographs import write_render
 from pipelines.survey.report import (

@@ -23,7 +23,7 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.remarks import Remarks
 from pipelines.ingest.rig_instants import Accompanying, Quaternion
-from pipelines.survey.calibrated import NavigationTrack
+from pipelines.survey.navigation import NavigationTrack
 from pipelines.survey.survey import CameraPrior
 
 SigmaSource = Literal["file", "option", "default"]

@@ -35,7 +35,7 @@ from pipelines.ingest.video_frames import (
     video_length,
     write_frames,
 )
-from pipelines.survey.calibrated import NavigationTrack
+from pipelines.survey.navigation import NavigationTrack
 from pipelines.survey.survey import Survey
 
 log = logging.getLogger(__name__)

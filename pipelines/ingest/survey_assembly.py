@@ -26,7 +26,7 @@ from pipelines.ingest.options import IngestOptions
 from pipelines.ingest.photo_folder import Photo
 from pipelines.ingest.readout_times import with_readouts, with_velocities
 from pipelines.ingest.remarks import Remarks, add
-from pipelines.survey.calibrated import FIX_RANGE_M, NavigationTrack, shown_by
+from pipelines.survey.navigation import FIX_RANGE_M, NavigationTrack, shown_by
 from pipelines.survey.survey import (
     LOCAL_FRAME,
     Attitude,

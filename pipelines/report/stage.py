@@ -43,7 +43,7 @@ from pipelines.report.record import (
 )
 from pipelines.report.verdicts import Measured, Verdict, verdicts
 from pipelines.report.views import adjusted_network, read_evaluated, seen_scene, training_facts, views_facts
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.report import EvaluationReport
 from pipelines.survey.solution import Solution, TrainedModel, read_sfm
 from pipelines.survey.survey import Survey

@@ -41,8 +41,8 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.sfm.colmap_database import FEATURES, add_features, copy_rows, drop_added_features, remove_database
 from pipelines.sfm.features import MAX_ANGLE_DEG, SfmJob, masks_beside, spread_of, steps, verification
 from pipelines.sfm.learned_weights import missing_for_learned
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.common_points import CommonPoints, solution_hash
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_solution
 from pipelines.survey.survey import Survey, SurveyImage
 

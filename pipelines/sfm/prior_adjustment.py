@@ -31,7 +31,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import residual_stats
 from pipelines.sfm.adjustment import position_adjuster
 from pipelines.sfm.options import AdjustOptions
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import MeasurementVerdict, SimilarityEstimate
 from pipelines.survey.survey import Fix, Survey
 

@@ -9,7 +9,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.measured_area import area_of
 from pipelines.survey.area import Area
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CropOptions
 from pipelines.survey.solution import read_sfm, read_solution
 

@@ -24,7 +24,7 @@ from pipelines.geometry.network import Network
 from pipelines.geometry.rolling_shutter import depths_at, in_rolling_shutter
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.photographs import ImageCache, Photograph
 from pipelines.survey.solution import SimilarityEstimate, Solution, read_solution
 from pipelines.survey.survey import Survey

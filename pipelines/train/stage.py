@@ -32,7 +32,7 @@ from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader, MeasuredFiles
 from pipelines.surface.photo_depths import DepthStatement, PhotoDepths, holds_depth_maps
 from pipelines.survey.area import boundary_area
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.report_parts import LidarReport

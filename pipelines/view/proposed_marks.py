@@ -19,8 +19,8 @@ from pipelines.core.types import ByteArray, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.tables import table_text
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import triangulated_points, wrong_marks
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import Solution, read_sfm, read_solution
 from pipelines.survey.survey import Mark, PointMarks, Survey, SurveyedPoint
 from pipelines.view.mark_views import proposals

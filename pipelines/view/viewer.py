@@ -21,8 +21,8 @@ from pipelines.geodesy.enu import lla_from_enu
 from pipelines.report.page import limited
 from pipelines.surface.picking import NoSurface, SurfacePoint
 from pipelines.surface.surface_views import ModelRenderer, model_renderer
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import mark_rays, wrong_marks
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.saved_measurements import NamedMeasurement, Quantity, SavedPoint, new_id
 from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.survey.survey import SurveyedPoint

@@ -19,8 +19,8 @@ from pipelines.core.stages import CHANGE, CLOUD
 from pipelines.core.staleness import StageState, changed_inputs
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.formats.geotiff import read_cells
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.change_report import Change
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_solution
 from pipelines.view.overlays import changed_regions
 from pipelines.view.pictures import frame_of

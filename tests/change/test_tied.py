@@ -20,9 +20,9 @@ from pipelines.core.stages import COMMON_POINTS, MODEL, SURVEY
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.geotiff import read_cells
 from pipelines.geodesy.crs import parse_crs
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.change_report import Change, ChangedRegion
 from pipelines.survey.common_points import CommonPoints
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import TrainedModel, read_sfm, read_solution
 from pipelines.survey.survey import Survey
 from pipelines.view.overlays import changed_regions

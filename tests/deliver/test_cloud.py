@@ -28,7 +28,7 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.surface import fusion
 from pipelines.surface.fusion import FusionSettings, SurfaceCloud, fused_squares, pixel_on_surface_m
 from pipelines.surface.surface_views import SurfaceViews
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from tests.depth_scenes import BOX_M, CAMERA, DOWN, depth_map, looking_down
 from tests.refusals import numbers, refused
 from tests.splat_scenes import ground_height

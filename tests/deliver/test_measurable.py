@@ -28,7 +28,7 @@ from pipelines.splat.gaussians import Gaussians, read_gaussians, write_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.surface.fusion import SurfaceCloud
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from tests.refusals import numbers, refused
 from tests.splat_scenes import ground_height
 

@@ -50,7 +50,7 @@ from pipelines.surface.poisson import (
 )
 from pipelines.surface.surface_views import SurfaceViews
 from pipelines.surface.texture import photographed_colours, textured
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from tests.depth_scenes import BOX_M, CAMERA, DOWN, UP, depth_map, looking_down
 from tests.refusals import refused
 from tests.splat_scenes import ground_height

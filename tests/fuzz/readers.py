@@ -57,7 +57,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.ingest.bag_inspection import inspect_bag
 from pipelines.sfm.foreign_cameras import foreign_file
 from pipelines.surface.measured_cloud import CloudReader
-from pipelines.survey.calibrated import NavigationTrack
+from pipelines.survey.navigation import NavigationTrack
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.report import EvaluationReport
 from pipelines.survey.solution import GeolocatedPoints, TrainedModel

@@ -11,7 +11,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.trajectory import mount
-from pipelines.survey.calibrated import NavigationTrack
+from pipelines.survey.navigation import NavigationTrack
 from tests import bags
 from tests.bags import Flight, Form, Message
 from tests.ingested_bags import Ingest, Refusal, check, remarked

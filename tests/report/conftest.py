@@ -16,7 +16,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.report.options import ReportOptions
 from pipelines.report.stage import run
 from pipelines.report.views import adjusted_network, read_evaluated, seen_scene
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.report import EvaluationReport
 from pipelines.survey.solution import Solution, read_sfm
 from pipelines.survey.survey import Survey

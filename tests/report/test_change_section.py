@@ -13,8 +13,8 @@ from pipelines.core.stages import CHANGE_FIGURES
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.report.page import Page, Section, render_page, signed_volume, volume
 from pipelines.report.record import RecordFacts, change_facts, record_facts
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.change_report import Change, DateOfChange, DoubtfulRegion, RegionAtDate
+from pipelines.survey.navigation import load_survey
 from tests.change_pairs import town_pair
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipelines.core.workspace import Workspace
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CrsOptions
 from pipelines.view.measuring import MeasuringModel
 from tests.splat_scenes import make_rendered

@@ -12,8 +12,8 @@ from pipelines.core.products import NOT_CHECKED, Remark
 from pipelines.core.workspace import Workspace
 from pipelines.surface.picking import NoSurface, Sight, SurfacePoint, depth_around, points_on_surface
 from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.marks import mark_rays
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CrsOptions
 from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel, WantedBase
 from pipelines.view.pictures import ViewerCamera, frame_of

@@ -14,7 +14,7 @@ from pipelines.core.stages import GAUSSIANS
 from pipelines.core.workspace import Workspace
 from pipelines.splat.gaussians import Gaussians, read_gaussians
 from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_solution
 from pipelines.view import motion
 from pipelines.view.pictures import Painter, Photographs, ViewerCamera, ViewFrame, Wanted, frame_of

@@ -34,7 +34,7 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.gaussians import Gaussians, transformed, write_gaussians
 from pipelines.splat.sh import sh_from_rgb
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import SolvedCamera, SolvedLens, read_sfm, read_trained
 from pipelines.survey.survey import Companion, Original, Survey
 from tests.band_photographs import band_tiff, dji_band, exposed, polynomial

@@ -21,8 +21,8 @@ from pipelines.splat.gaussians import read_gaussians, write_gaussians
 from pipelines.surface import measured_area
 from pipelines.surface.measured_area import area_of
 from pipelines.survey.area import Area
-from pipelines.survey.calibrated import load_survey
 from pipelines.survey.measured_ground import MeasuredGround
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CrsOptions, FilledAreaOptions
 from pipelines.survey.report import read_report
 from pipelines.survey.solution import Solution, read_sfm, read_solution

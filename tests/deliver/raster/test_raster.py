@@ -36,7 +36,7 @@ from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
 from pipelines.surface.measured_area import area_of
-from pipelines.survey.calibrated import load_survey
+from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import FilledAreaOptions
 from pipelines.survey.solution import SolvedCamera, TrainedModel, read_sfm, read_solution
 from tests.refusals import codes, refused
@@ -152,7 +152,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
 
 def in_utm(points_in_geo: np.ndarray, workspace: Workspace) -> np.ndarray:
     """Return points (N, 3) in UTM, by pyproj alone."""
-    from pipelines.survey.calibrated import load_survey
+    from pipelines.survey.navigation import load_survey
 
     lat, lon, height = lla_from_enu(points_in_geo, load_survey(workspace).origin).T
     east, north = pyproj.Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(lon, lat)

@@ -1,4 +1,4 @@
-"""Survey with its calibrated rig: positions and attitudes recomputed from the recorded navigation."""
+"""Navigation of a survey as it was recorded, and the survey whose positions a calibrated rig reads off it."""
 
 import logging
 from dataclasses import dataclass, replace
