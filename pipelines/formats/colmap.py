@@ -23,8 +23,12 @@ from pipelines.core.files import file_size, storage_failure_of
 from pipelines.core.products import ImageName, Product, load_json
 from pipelines.core.types import FloatArray, IntArray, Vector3
 from pipelines.core.validators import stays_inside
-from pipelines.formats.colmap_text import check_images_text
-from pipelines.formats.colmap_values import check_lenses, check_quaternions_text, quaternion_fault
+from pipelines.formats.colmap_checks import (
+    check_images_text,
+    check_lenses,
+    check_quaternions_text,
+    quaternion_fault,
+)
 from pipelines.geometry.cameras import Camera, Reconstruction, pycolmap_module
 from pipelines.geometry.sparse_model import SparseModel
 
