@@ -37,11 +37,10 @@ from pipelines.view.marking import (
     residuals_px,
     surveyed_marks,
 )
-from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel
+from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel, pointing_covariance
 from pipelines.view.options import ViewOptions
 from pipelines.view.page_scene import described_scene
 from pipelines.view.pictures import PageView, Painter, Photographs, frame_of
-from pipelines.view.pointing import pointing_covariance
 from pipelines.view.quantities import Profile, distances, length
 from pipelines.view.saved import FOLDER, SavedMeasurements
 from pipelines.view.work import Jobs, ViewJob

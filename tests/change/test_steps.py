@@ -22,7 +22,7 @@ from pipelines.formats.geotiff import read_cells
 from pipelines.survey.change_report import Change
 from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import read_sfm, read_solution
-from pipelines.view.overlays import changed_regions
+from pipelines.view.page_scene import changed_regions
 from pipelines.view.pictures import frame_of
 from tests.change_pairs import CELL_M, TownPair, town_pair
 

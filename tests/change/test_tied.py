@@ -25,7 +25,7 @@ from pipelines.survey.common_points import CommonPoints
 from pipelines.survey.navigation import load_survey
 from pipelines.survey.solution import TrainedModel, read_sfm, read_solution
 from pipelines.survey.survey import Survey
-from pipelines.view.overlays import changed_regions
+from pipelines.view.page_scene import changed_regions
 from pipelines.view.pictures import frame_of
 from tests.change_pairs import TownPair, nudge_first_camera, tie, town_pair
 from tests.refusals import refused

@@ -15,9 +15,8 @@ from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import mark_rays
 from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CrsOptions
-from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel, WantedBase
+from pipelines.view.measuring import ESTIMATE, Fineness, MeasuringModel, WantedBase, pointing_covariance
 from pipelines.view.pictures import ViewerCamera, frame_of
-from pipelines.view.pointing import pointing_covariance
 from pipelines.view.quantities import along_line, distances
 from tests.splat_scenes import ground_height
 from tests.view_scenes import renderer_of
