@@ -25,8 +25,7 @@ from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
-from pipelines.splat.rasterizer.backends import rasterizer
-from pipelines.splat.rasterizer.mip_filter import MipFiltered
+from pipelines.splat.rasterizer.backends import MipFiltered, rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader, MeasuredFiles

@@ -1,14 +1,17 @@
-"""Rasteriser backends by name."""
+"""Rasteriser backends by name, and the one whose renders all have the mip filter."""
 
 import logging
+from dataclasses import replace
 from typing import Literal
 
 import torch
+from torch import Tensor
 
 from pipelines.core.errors import BackendUnavailableError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.splat.rasterizer.api import BackendName, Rasterizer
-from pipelines.splat.rasterizer.mip_filter import MipFiltered
+from pipelines.geometry.cameras import Pinhole
+from pipelines.splat.gaussians import Gaussians
+from pipelines.splat.rasterizer.api import BackendName, Rasterizer, RasterSettings, Render
 
 BACKENDS: tuple[BackendName, ...] = ("cpu", "cuda")
 
@@ -59,3 +62,23 @@ def _plain(name: Literal["auto", "cpu", "cuda"], progress: Progress) -> Rasteriz
     from pipelines.splat.rasterizer.cpu import CpuRasterizer
 
     return CpuRasterizer()
+
+
+class MipFiltered:
+    """Another backend with the mip filter (`RasterSettings.mip_filter`) in all renders, as a training had it."""
+
+    def __init__(self, backend: Rasterizer) -> None:
+        self._backend = backend
+        self.name, self.device = backend.name, backend.device
+
+    def render(
+        self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
+    ) -> Render:
+        """See `Rasterizer.render`."""
+        return self._backend.render(gaussians, cam_from_model, camera, replace(settings, mip_filter=True))
+
+    def candidates(
+        self, gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, settings: RasterSettings
+    ) -> Tensor | None:
+        """See `Rasterizer.candidates`."""
+        return self._backend.candidates(gaussians, cam_from_model, camera, replace(settings, mip_filter=True))
