@@ -31,7 +31,7 @@ from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
 from pipelines.geodesy.geotiff_keys import FileCrs
 from pipelines.geometry.footprints import voxel_keys
-from pipelines.surface.mesh_samples import meets_box, samples, triangle_areas
+from pipelines.surface.mesh import meets_box, samples, triangle_areas
 from pipelines.survey.options import CLOUD_SUFFIXES, CloudCrs
 
 log = logging.getLogger(__name__)

@@ -1,5 +1,6 @@
-"""Triangle meshes: normals, distances, connected parts, holes, and walls and fans that close them."""
+"""Triangle meshes: areas, normals, distances, evenly spread points, connected parts, holes and what closes them."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,9 +8,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 
 _NEAR_FACES = 4  # of those nearest a vertex whose distance is measured
+_MOST_SAMPLES = 60_000_000
+# Steps of the two coordinates within triangles: multiples of them fill a square evenly (doi 10.1016/0022-314X(89)
+# 90035-5: the generalised golden ratio).
+_STEPS = np.array([0.7548776662466927, 0.5698402909980532])
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ def distances_from_mesh(points: FloatArray, mesh: RawMesh, step_m: float) -> Flo
     from trimesh.triangles import closest_point
 
     corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    area = triangle_areas(mesh.vertices, mesh.faces)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     count = np.ceil(np.maximum(2 * area / step_m**2, longest / step_m)).astype(np.int64) + 1
     face = np.repeat(np.arange(len(corners)), count)
@@ -57,8 +62,7 @@ def distances_from_mesh(points: FloatArray, mesh: RawMesh, step_m: float) -> Flo
 def without_islands(mesh: RawMesh, least_m2: float) -> tuple[RawMesh, int]:
     """Return the largest connected part and others of at least an area, and the number of the parts left out."""
     number, part = parts_of(mesh)
-    corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    area = triangle_areas(mesh.vertices, mesh.faces)
     areas = np.bincount(part, area, number)
     kept = areas >= min(least_m2, areas.max())
     return compact(RawMesh(mesh.vertices, mesh.faces[kept[part]])), int((~kept & (areas > 0)).sum())
@@ -168,3 +172,38 @@ def _cycles(edges: IntArray) -> list[IntArray]:
                 if len(path) == 1:
                     break
     return cycles
+
+
+def triangle_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """Return the areas (F,) of triangles (F, 3) of vertices (V, 3)."""
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+    return np.asarray(np.linalg.norm(np.cross(second - first, third - first), axis=1) / 2)
+
+
+def meets_box(
+    vertices: FloatArray, faces: IntArray, low: FloatArray | float, high: FloatArray | float
+) -> BoolArray:
+    """Return whether the box around a triangle meets the box from `low` (3,) to `high` (3,), for each (F,)."""
+    corners = vertices[faces]
+    return np.asarray(((corners.max(axis=1) >= low) & (corners.min(axis=1) <= high)).all(axis=1))
+
+
+def samples(vertices: FloatArray, faces: IntArray, spacing_m: float, size: int) -> Iterator[FloatArray]:
+    """Yield points (P, 3) on triangles (F, 3) of vertices (V, 3) in metres, P ≤ `size`, as a cloud has them.
+
+    Each stands for an area of `spacing_m` squared: their number follows the area, however small the triangles.
+    With more than 60 million points, they lie further apart.
+    """
+    until = np.cumsum(triangle_areas(vertices, faces))
+    whole = float(until[-1]) if len(until) else 0.0
+    if whole <= 0:
+        return
+    count = int(np.ceil(min(whole / spacing_m**2, _MOST_SAMPLES)))
+    for first in range(0, count, size):
+        number = np.arange(first, min(first + size, count))
+        triangle = np.searchsorted(until, (number + 0.5) / count * whole)
+        along = ((number[:, None] + 1) * _STEPS) % 1.0
+        # The half of the square beyond the diagonal is folded onto the triangle.
+        along = np.where(along.sum(axis=1, keepdims=True) > 1, 1 - along, along)
+        corner, second, third = (vertices[faces[triangle, place]] for place in range(3))
+        yield corner + along[:, :1] * (second - corner) + along[:, 1:] * (third - corner)
