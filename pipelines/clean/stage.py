@@ -1,11 +1,11 @@
 """Stage `clean`: a model without floaters, of a wished size, made from the trained one; the loss is stated.
 
 1. Gaussians that are too transparent, or outside a crop, go.
-2. Of the others, floaters go: those whose place (`surface.floaters`) and whose looks say so. A place alone does
+2. Of the others, floaters go: those whose place (`clean.floaters`) and whose looks say so. A place alone does
    not: stereo misses wires, and the sky is far from everything. The looks are an opacity below a tenth, or
    photographs whose error grows with the opacity.
 3. With --gaussians, those that show least in the training views are merged into their neighbours
-   (`splat.consolidation`). With --sh-degree, harmonics are cut off.
+   (`clean.consolidation`). With --sh-degree, harmonics are cut off.
 4. After step 3, what is left is fitted to the renders of the trained model.
 
 Reads `ingest/survey.json`, the photographs, `sfm/sparse`, `sim3/`, `train/model.json` and `train/gaussians.ply`.
@@ -24,7 +24,8 @@ import numpy as np
 import torch
 from scipy.special import expit
 
-from pipelines.clean.evidence import Evidence, evidence_of
+from pipelines.clean.consolidation import consolidated, most_shown
+from pipelines.clean.floaters import Evidence, MeasuredView, before_surface, evidence_of, isolated
 from pipelines.clean.options import CleanOptions
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import Product, Remark, save_json
@@ -34,14 +35,12 @@ from pipelines.core.types import BoolArray, ByteArray
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.geometry.cameras import ViewPose, pose_matrix
 from pipelines.splat.appearance import WITH_SHAPES, ShownView, refine_appearance, shuffled_passes
-from pipelines.splat.consolidation import consolidated, most_shown
 from pipelines.splat.gaussians import Gaussians, write_gaussians
 from pipelines.splat.initialise import scene_extent
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.sh import coefficient_count
-from pipelines.surface.crop import crop_of
 from pipelines.surface.depth_maps import DepthMaps
-from pipelines.surface.floaters import MeasuredView, before_surface, isolated
+from pipelines.surface.measured_area import crop_of
 from pipelines.surface.photometry import mean_psnr
 from pipelines.surface.surface_views import ModelRenderer, model_renderer
 from pipelines.survey.navigation import load_survey

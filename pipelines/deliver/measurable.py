@@ -47,8 +47,8 @@ from pipelines.splat.metrics import psnr
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings
 from pipelines.splat.sh import coefficient_count
 from pipelines.splat.surface import surface_discs
-from pipelines.surface.crop import crop_of
 from pipelines.surface.fusion import SurfaceCloud, fused_squares, fusion_settings, pixel_on_surface_m
+from pipelines.surface.measured_area import crop_of
 from pipelines.surface.surface_views import ModelRenderer, SurfaceView, SurfaceViews, model_renderer
 from pipelines.survey.headline import headline_of
 from pipelines.survey.navigation import load_survey

@@ -26,7 +26,7 @@ from pipelines.deliver.placement import Placement, solved_placement
 from pipelines.formats.splat_ply import SplatArrays, read_centres, read_logit_opacities
 from pipelines.splat.gaussians import Gaussians, read_gaussians, transformed
 from pipelines.splat.sh import coefficient_count
-from pipelines.surface.crop import Crop, crop_of
+from pipelines.surface.measured_area import Crop, crop_of
 from pipelines.survey.block_plan import BlockRecord
 from pipelines.survey.headline import headline_of
 from pipelines.survey.navigation import load_survey

@@ -1,4 +1,4 @@
-"""Area of interest: the user's boundary, or the outline of the surface that three training views measure.
+"""Area of interest: the user's boundary, or the surface that three views measure; and the crop of a splat to it.
 
 One area ends every product: rasters, cloud, mesh, crop of the splat, viewer, and the area that the report states.
 It is a function of the trained model and of two options. What is measured is found once from small depth maps, and
@@ -7,7 +7,7 @@ kept in the cache of the workspace, under a key of the model.
 
 import hashlib
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,17 +15,19 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import GAUSSIANS, MODEL
-from pipelines.core.types import Float32Array, FloatArray, IntArray
+from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.cameras import Pinhole, ViewPose
+from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.surface import measured_depth
 from pipelines.surface.surface_views import SAME_SURFACE, ModelRenderer, model_renderer, photo_consistent
 from pipelines.surface.visibility import DepthViews, Viewpoints, support
 from pipelines.survey.area import Area, boundary_area, depths_of_observations, scene_in_geo, seen_area
 from pipelines.survey.measured_ground import MeasuredGround
-from pipelines.survey.options import LEAST_PHOTOGRAPHS, FilledAreaOptions
-from pipelines.survey.solution import Solution, TrainedModel, read_trained
+from pipelines.survey.navigation import load_survey
+from pipelines.survey.options import LEAST_PHOTOGRAPHS, CropOptions, FilledAreaOptions
+from pipelines.survey.solution import Solution, TrainedModel, read_sfm, read_solution, read_trained
 from pipelines.survey.survey import Survey
 
 _LONGEST_PX = 320  # of the depth maps
@@ -229,3 +231,30 @@ class _Cells:
 
     def _rows_in_views(self) -> IntArray:
         return np.flatnonzero(self._views >= LEAST_PHOTOGRAPHS)
+
+
+@dataclass(frozen=True)
+class Crop:
+    """Area outside which Gaussians are left out; those higher than `sky_m` in `geo` stay."""
+
+    area: Area
+    geo_from_model: Similarity
+    sky_m: float
+
+    def keeps(self, center_in_model: FloatArray | Float32Array) -> BoolArray:
+        """Return which of Gaussians' centres (N, 3) stay."""
+        center = self.geo_from_model.apply(center_in_model)
+        return self.area.contains(center) | (center[:, 2] > self.sky_m)
+
+
+def crop_of(workspace: Workspace, options: CropOptions) -> Crop | None:
+    """Return the crop that the options ask for; None: none. Errors as of `read_solution` and `area_of`.
+
+    The sky is what lies higher than all cameras.
+    """
+    if not options.crop and options.boundary is None:
+        return None
+    solution = read_solution(workspace)
+    sfm, survey, cameras = read_sfm(workspace, solution), load_survey(workspace), solution.center_in_geo
+    sky_m = float(cameras[:, 2].max()) if options.keep_sky else np.inf
+    return Crop(area_of(options, workspace, solution, sfm, survey), solution.similarity, sky_m)

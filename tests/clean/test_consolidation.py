@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from pipelines.clean.consolidation import consolidated, most_shown
 from pipelines.formats.splat_ply import SplatArrays
 from pipelines.geometry.cameras import Pinhole
-from pipelines.splat.consolidation import consolidated, most_shown
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.level_of_detail import mixture_of
 from pipelines.splat.metrics import psnr

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from pipelines.clean.floaters import LEAST_VIEWS, SIGMA_DEPTH, MeasuredView, before_surface, isolated
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.splat.gaussians import Gaussians
-from pipelines.surface.floaters import LEAST_VIEWS, SIGMA_DEPTH, MeasuredView, before_surface, isolated
 
 CAMERA = Pinhole(80, 60, 80.0, 80.0, 40.0, 30.0)
 HEIGHT_M = 20.0
