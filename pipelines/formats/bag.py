@@ -201,6 +201,19 @@ def open_bag(path: Path) -> Iterator[Bag]:
     Raises:
         BackendUnavailableError: rosbags is not installed.
         InputError: no bag, damaged beyond opening, or with chunks too large for memory.
+
+    Examples:
+        >>> from rosbags.rosbag2 import Writer
+        >>> from rosbags.typesys import Stores, get_typestore
+        >>> store = get_typestore(Stores.ROS2_JAZZY)
+        >>> text = store.types["std_msgs/msg/String"]
+        >>> with Writer(Path("flight"), version=9) as writer:
+        ...     topic = writer.add_connection("/events", text.__msgtype__, typestore=store)
+        ...     data = store.serialize_cdr(text("take-off"), text.__msgtype__)
+        ...     writer.write(topic, 1_700_000_000_000_000_000, data)
+        >>> with open_bag(Path("flight")) as bag:
+        ...     [bag.decode(message).data for message in bag.messages(["/events"])]
+        ['take-off']
     """
     if not path.exists():
         raise InputError("bag-missing", "The bag does not exist.", path=path, field="--bag")

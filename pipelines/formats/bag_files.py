@@ -59,6 +59,19 @@ def open_files(path: Path) -> Iterator[BagFiles]:
     Raises:
         InputError: no data file, one that is listed is lost, or forged ones.
         Exception: any error of rosbags' parsers.
+
+    Examples:
+        >>> from rosbags.rosbag2 import Writer
+        >>> from rosbags.typesys import Stores, get_typestore
+        >>> store = get_typestore(Stores.ROS2_JAZZY)
+        >>> text = store.types["std_msgs/msg/String"]
+        >>> with Writer(Path("flight"), version=9) as writer:
+        ...     topic = writer.add_connection("/events", text.__msgtype__, typestore=store)
+        ...     data = store.serialize_cdr(text("take-off"), text.__msgtype__)
+        ...     writer.write(topic, 1_700_000_000_000_000_000, data)
+        >>> with open_files(Path("flight")) as files:
+        ...     files.stated
+        {'/events': ('std_msgs/msg/String', 1)}
     """
     check_files(path)
     bound_decompressors()

@@ -105,6 +105,14 @@ def read_boundary(path: Path, *, field: str) -> Boundary:
     Raises:
         InputError: not such a file, too large, damaged, with a coordinate that is no number, or without an area;
             names file and option.
+
+    Examples:
+        >>> _ = Path("site.geojson").write_text(
+        ...     '{"type": "Polygon", "coordinates": [[[7, 46], [7.1, 46], [7.1, 46.1], [7, 46]]]}'
+        ... )
+        >>> layer = read_boundary(Path("site.geojson"), field="--boundary").layers[0]
+        >>> layer.polygons[0].wkt, layer.crs
+        ('POLYGON ((7 46, 7.1 46, 7.1 46.1, 7 46))', 'EPSG:4326')
     """
     refusal = partial(InputError, path=path, field=field)
     file_size(path, limit_bytes=_MOST_BYTES, kind="boundary", field=field)

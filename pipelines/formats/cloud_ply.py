@@ -129,6 +129,12 @@ def open_cloud_ply(path: Path) -> PlyCloudFile:
 
     Raises:
         InputError: no such file, not a binary PLY, without coordinates, or cut off.
+
+    Examples:
+        >>> write_point_ply(Path("cloud.ply"), np.array([[10.0, 20.0, 498.5]]), np.zeros((1, 3), np.uint8))
+        >>> file = open_cloud_ply(Path("cloud.ply"))
+        >>> file.count, next(file.chunks(1000)).position.tolist()
+        (1, [[10.0, 20.0, 498.5]])
     """
     lines, offset, size = ply_header(path)
     form = next((line[1] for line in lines if line[:1] == ["format"] and len(line) > 1), "")

@@ -180,13 +180,21 @@ _RECORDS: dict[str, Callable[[_Bytes, int], int]] = {
 
 
 def read_sparse(path: Path) -> SparseModel:
-    """Read the COLMAP model (cameras, images, points3D as .bin or .txt) in a folder.
+    r"""Read the COLMAP model (cameras, images, points3D as .bin or .txt) in a folder.
 
     Images without a pose and observations without a point are left out. The motion of the cameras comes from the
     file beside the model, if there is one.
 
     Raises:
         InputError: unreadable, inconsistent, or with values that are not finite.
+
+    Examples:
+        >>> _ = Path("cameras.txt").write_text("1 PINHOLE 400 300 350 350 200 150\n")
+        >>> _ = Path("images.txt").write_text("1 1 0 0 0 -2 -3 5 1 a.jpg\n\n")
+        >>> Path("points3D.txt").touch()
+        >>> model = read_sparse(Path())
+        >>> model.image_name, model.cam_center_in_local.tolist(), model.focal_px.tolist()
+        (('a.jpg',), [[2.0, 3.0, -5.0]], [350.0])
     """
     model = flatten(load_reconstruction(path))
     if (path / ROLLING_SHUTTER).exists():
@@ -264,11 +272,18 @@ def write_reconstruction(reconstruction: Reconstruction, folder: Path) -> None:
 
 
 def load_reconstruction(path: Path) -> Any:
-    """Return the COLMAP model in a folder as a `pycolmap.Reconstruction`.
+    r"""Return the COLMAP model in a folder as a `pycolmap.Reconstruction`.
 
     Raises:
         InputError: no such folder, not a readable model, one whose counts do not fit its files, or poses or lenses
             that are nonsense.
+
+    Examples:
+        >>> _ = Path("cameras.txt").write_text("1 PINHOLE 400 300 350 350 200 150\n")
+        >>> _ = Path("images.txt").write_text("1 1 0 0 0 -2 -3 5 1 a.jpg\n\n")
+        >>> Path("points3D.txt").touch()
+        >>> load_reconstruction(Path()).images[1].projection_center().tolist()  # −Rᵀ t
+        [2.0, 3.0, -5.0]
     """
     model = _loaded(path)
     files = (path / f"cameras{suffix}" for suffix in (".bin", ".txt"))

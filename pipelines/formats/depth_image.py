@@ -40,6 +40,12 @@ def read_depth_image(path: Path) -> DepthImage:
     Raises:
         InputError: no such image, eight bits, several channels of which none is depth, too many pixels, or damaged.
         BackendUnavailableError: an EXR, and its library is missing; names the extra.
+
+    Examples:
+        >>> import cv2
+        >>> _ = cv2.imwrite("depth.png", np.array([[0, 1500], [1510, 65535]], dtype=np.uint16))
+        >>> read_depth_image(Path("depth.png")).value.tolist()  # in the unit of the file, here millimetres
+        [[nan, 1500.0], [1510.0, nan]]
     """
     if path.suffix.lower() == ".exr":
         return _read_exr(path)

@@ -128,6 +128,16 @@ def open_e57(path: Path) -> E57File:
     Raises:
         InputError: no such file, not a readable E57 file, or one without points.
         BackendUnavailableError: pye57 is missing; names the extra.
+
+    Examples:
+        >>> import pye57
+        >>> scan = pye57.E57("scan.e57", mode="w")
+        >>> places = np.array([[10.0, 20.0, 498.5], [10.5, 20.0, 498.75]])
+        >>> scan.write_scan_raw({f"cartesian{axis}": places[:, at] for at, axis in enumerate("XYZ")})
+        >>> scan.close()
+        >>> file = open_e57(Path("scan.e57"))
+        >>> file.count, next(file.chunks(1000)).position.tolist()
+        (2, [[10.0, 20.0, 498.5], [10.5, 20.0, 498.75]])
     """
     require("scans")
     size = file_size(path)

@@ -129,7 +129,19 @@ class PhotoTags:
 
 
 def read_tags(data: bytes) -> PhotoTags:
-    """Return EXIF and XMP of a photograph; tags that cannot be read become `problems`, never an error."""
+    r"""Return EXIF and XMP of a photograph; tags that cannot be read become `problems`, never an error.
+
+    Examples:
+        >>> from pipelines.formats.exif_writer import DroneTags, with_tags
+        >>> drone = DroneTags(
+        ...     width=400, height=300, focal_px=350.0, stamp_ns=0, lat_deg=46.8, lon_deg=7.1, alt_m=512.0,
+        ...     relative_alt_m=50.0, yaw_pitch_roll_deg=(0.0, -90.0, 0.0), body_yaw_pitch_roll_deg=(0.0, 0.0, 0.0),
+        ...     sigma_enu_m=(0.01, 0.01, 0.02),
+        ... )
+        >>> tags = read_tags(with_tags(b"\xff\xd8\xff\xd9", drone))
+        >>> tags.gps.lat_deg, tags.gps.lon_deg, tags.gps.alt_m, tags.dji.rtk_sigma_enu_m
+        (46.8, 7.1, 512.0, (0.01, 0.01, 0.02))
+    """
     blocks = find_blocks(data)
     notes = _Notes(list(blocks.problems), [])
     directories = [_tags_of(block) for block in blocks.exif]

@@ -219,7 +219,14 @@ def write_vrt(
 
 
 def read_cells(path: Path, part: tuple[slice, slice] | None = None) -> NDArray[Any]:
-    """Return the bands (bands, rows, columns) of a raster, or of rows and columns that lie in it; NaN: no value."""
+    """Return the bands (bands, rows, columns) of a raster, or of rows and columns that lie in it; NaN: no value.
+
+    Examples:
+        >>> frame = RasterFrame("EPSG:32632", west=100.0, north=50.0, step_x=0.5, step_y=0.5, columns=2, rows=2)
+        >>> write_part(Path("dsm.tif"), np.array([[[498.5, 499.5], [500.5, np.nan]]], np.float32), frame)
+        >>> read_cells(Path("dsm.tif")).tolist()
+        [[[498.5, 499.5], [500.5, nan]]]
+    """
     from rasterio.windows import Window
 
     with _opened(path) as raster:
@@ -255,7 +262,14 @@ def is_same_crs(first: RasterFrame, second: RasterFrame) -> bool:
 def read_onto(
     path: Path, frame: RasterFrame, resampling: Literal["nearest", "bilinear", "average"]
 ) -> NDArray[Any]:
-    """Return the first band (rows, columns) of a raster on the cells of a frame in its CRS; NaN or 0: no value."""
+    """Return the first band (rows, columns) of a raster on the cells of a frame in its CRS; NaN or 0: no value.
+
+    Examples:
+        >>> frame = RasterFrame("EPSG:32632", west=100.0, north=50.0, step_x=0.5, step_y=0.5, columns=2, rows=2)
+        >>> write_part(Path("dsm.tif"), np.array([[[498.5, 499.5], [500.5, np.nan]]], np.float32), frame)
+        >>> read_onto(Path("dsm.tif"), frame.resized(1, 1), "average").tolist()
+        [[499.5]]
+    """
     with _warped(path, frame, resampling) as warped:
         values = warped.read(1)
     if values.dtype == np.uint8:
@@ -264,7 +278,15 @@ def read_onto(
 
 
 def read_colours_onto(path: Path, frame: RasterFrame) -> ByteArray:
-    """Return the colours (rows, columns, bands) of a raster of bytes, averaged on the cells of a frame."""
+    """Return the colours (rows, columns, bands) of a raster of bytes, averaged on the cells of a frame.
+
+    Examples:
+        >>> frame = RasterFrame("EPSG:32632", west=100.0, north=50.0, step_x=0.5, step_y=0.5, columns=2, rows=2)
+        >>> bands = np.array([[[0, 100], [200, 100]], [[10, 10], [10, 10]], [[0, 0], [0, 0]]], np.uint8)
+        >>> write_part(Path("orthophoto.tif"), bands, frame)
+        >>> read_colours_onto(Path("orthophoto.tif"), frame.resized(1, 1)).tolist()
+        [[[100, 10, 0]]]
+    """
     with _warped(path, frame, "average") as warped:
         return np.ascontiguousarray(np.moveaxis(warped.read(), 0, -1), dtype=np.uint8)
 
@@ -315,6 +337,13 @@ def read_reduced(path: Path, longest_px: int) -> tuple[NDArray[Any], float]:
     """Return the bands (bands, rows, columns) of a raster, averaged to a longest side, and the size of a cell.
 
     Float rasters have NaN where there is no value.
+
+    Examples:
+        >>> frame = RasterFrame("EPSG:32632", west=100.0, north=50.0, step_x=0.5, step_y=0.5, columns=2, rows=2)
+        >>> write_part(Path("dsm.tif"), np.array([[[498.5, 499.5], [500.5, np.nan]]], np.float32), frame)
+        >>> bands, cell = read_reduced(Path("dsm.tif"), longest_px=1)
+        >>> bands.tolist(), cell
+        ([[[499.5]]], 1.0)
     """
     from rasterio.enums import Resampling
 

@@ -115,6 +115,12 @@ def decode_plain_glb(data: bytes, path: Path | None = None) -> SplatArrays:
 
     Raises:
         InputError: not such a file, or damaged; names the path.
+
+    Examples:
+        >>> shapes = (1, 3), (1, 4), (1, 3), (1,), (1, 1, 3)  # mean, rotation, ln σ, logit of opacity, harmonics
+        >>> splat = SplatArrays(*(np.ones(shape, np.float32) for shape in shapes))
+        >>> decode_plain_glb(encode_plain_glb(splat)).means.tolist()
+        [[1.0, 1.0, 1.0]]
     """
     try:
         magic, _, _, size = struct.unpack_from("<IIII", data)

@@ -70,8 +70,9 @@ def read_mrk(path: Path) -> CameraEvents:
         ...     "1\t302418.500000\t[2312]\t-66,N\t10,E\t194,V\t46.80000000,Lat\t7.10000000,Lon\t512.000,Ellh\t"
         ...     "0.011, 0.012, 0.025\t50,Q\n"
         ... )
-        >>> len(read_mrk(Path("flight.MRK")).lines)
-        1
+        >>> events = read_mrk(Path("flight.MRK"))
+        >>> events.lon_lat_alt.tolist(), events.camera_from_antenna_enu_m.tolist(), events.receiver.tolist()
+        ([[7.1, 46.8, 512.0]], [[0.01, -0.066, -0.194]], ['RTK fixed'])
     """
     lines: list[int] = []
     values: list[list[float]] = []
@@ -122,11 +123,23 @@ class _Header:
 
 
 def read_pos(path: Path) -> PoseTable:
-    """Read a solution.
+    r"""Read a solution.
 
     Raises:
         InputError: no header, a baseline instead of positions, no row, too few cells, a cell that is no number, or
             a value out of range.
+
+    Examples:
+        >>> _ = Path("camera.pos").write_text(
+        ...     "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,5:single,ns=# of satellites)\n"
+        ...     "%  GPST  latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m)\n"
+        ...     "2024/05/01 12:00:18.000 46.8 7.1 512.0 1 9 0.008 0.007 0.015\n"
+        ... )
+        >>> solution = read_pos(Path("camera.pos"))
+        >>> solution.xyz.tolist()  # longitude, latitude, ellipsoidal height
+        [[7.1, 46.8, 512.0]]
+        >>> solution.sigma_enu_m.tolist(), solution.receiver.tolist()
+        ([[0.007, 0.008, 0.015]], ['RTK fixed'])
     """
     lines = numbered_lines(path)
     header = _header([(at, text) for at, text in lines if text.startswith("%")], path)
@@ -280,8 +293,9 @@ def read_subtitles(path: Path) -> VideoPositions:
         ...     "1\n00:00:00,000 --> 00:00:00,033\n"
         ...     "[latitude: 46.8] [longitude: 7.1] [rel_alt: 50.0 abs_alt: 512.0]\n"
         ... )
-        >>> len(read_subtitles(Path("video.SRT")).lines)
-        1
+        >>> positions = read_subtitles(Path("video.SRT"))
+        >>> positions.time_s.tolist(), positions.lon_lat_height.tolist(), positions.heights_above_geoid
+        ([0.0], [[7.1, 46.8, 512.0]], True)
     """
     lines: list[int] = []
     values: list[list[float]] = []

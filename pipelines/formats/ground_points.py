@@ -100,8 +100,9 @@ def read_geo(path: Path) -> PoseTable:
 
     Examples:
         >>> _ = Path("geo.txt").write_text("EPSG:32632\na.jpg 500000 5180000 512\n")
-        >>> read_geo(Path("geo.txt")).names
-        ('a.jpg',)
+        >>> table = read_geo(Path("geo.txt"))
+        >>> table.names, table.xyz.tolist(), table.crs_text
+        (('a.jpg',), [[500000.0, 5180000.0, 512.0]], 'EPSG:32632')
     """
     table = _odm_table(path, _GEO_COLUMNS)
     numbers = []

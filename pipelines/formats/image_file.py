@@ -74,7 +74,14 @@ class ImageFile:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the bytes of the whole file; an InputError: unreadable, empty, or larger than 512 MiB."""
+    """Return the bytes of the whole file; an InputError: unreadable, empty, or larger than 512 MiB.
+
+    Examples:
+        >>> import cv2
+        >>> _ = cv2.imwrite("a.png", np.zeros((300, 400, 3), np.uint8))
+        >>> inspect_image(read_bytes(Path("a.png")), Path("a.png")).width
+        400
+    """
     if file_size(path, limit_bytes=MAX_BYTES, kind="photograph") == 0:
         raise InputError("file-empty", "The file is empty.", path=path)
     with reading(path):
@@ -86,6 +93,12 @@ def read_head(path: Path) -> bytes:
 
     Raises:
         InputError: as `read_bytes`.
+
+    Examples:
+        >>> import cv2
+        >>> _ = cv2.imwrite("a.png", np.zeros((300, 400, 3), np.uint8))
+        >>> header_size(read_head(Path("a.png")))
+        (400, 300)
     """
     with reading(path), path.open("rb") as file:
         head = file.read(_HEAD_BYTES)

@@ -25,6 +25,12 @@ def read_kml(data: bytes, refusal: Callable[..., InputError]) -> list[Any]:
     Raises:
         InputError: by `refusal`: no KML, not well-formed, with entities of its own, or a coordinate that is no
             number.
+
+    Examples:
+        >>> line = b"<LineString><coordinates>7,46,0 7.1,46.2,0</coordinates></LineString>"
+        >>> shapes = read_kml(b"<kml><Placemark>" + line + b"</Placemark></kml>", InputError)
+        >>> [shape.wkt for shape in shapes]
+        ['LINESTRING (7 46, 7.1 46.2)']
     """
     from pyexpat import ExpatError, ParserCreate
 

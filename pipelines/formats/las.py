@@ -79,6 +79,15 @@ def open_las(path: Path) -> LasFile:
 
     Raises:
         InputError: no such file, or not a readable LAS file.
+
+    Examples:
+        >>> import laspy
+        >>> cloud = laspy.create()
+        >>> cloud.xyz = np.array([[10.0, 20.0, 498.5], [10.5, 20.0, 498.6]])
+        >>> cloud.write("cloud.las")
+        >>> file = open_las(Path("cloud.las"))
+        >>> file.count, next(file.chunks(1000)).position.tolist()
+        (2, [[10.0, 20.0, 498.5], [10.5, 20.0, 498.6]])
     """
     size = file_size(path)
     with _damage(path):
@@ -219,6 +228,20 @@ def read_surface(path: Path, size: int) -> Iterator[CloudPoints]:
 
     Raises:
         InputError: no such file, a damaged one, or one without normals and covariances.
+
+    Examples:
+        >>> point = CloudPoints(
+        ...     position=np.array([[500010.0, 5180020.0, 498.5]]), normal=np.array([[0, 0, 1]], np.float32),
+        ...     rgb=np.full((1, 3), 128, np.uint8), cov_m2=0.0625 * np.eye(3, dtype=np.float32)[None],
+        ...     classification=np.array([2], np.uint8),
+        ... )
+        >>> with LazWriter(
+        ...     Path("cloud.laz"), wkt1="", angular=False, near=point.position[0], software="example"
+        ... ) as writer:
+        ...     writer.write(point)
+        >>> read = next(read_surface(Path("cloud.laz"), size=1000))
+        >>> read.position.tolist(), read.sigma_v_m.tolist()
+        ([[500010.0, 5180020.0, 498.5]], [0.25])
     """
     with _damage(path), _opened(path, open_las(path).head) as file:
         lacking = (_EXTRA.keys() | _COVARIANCE.keys()) - set(file.header.point_format.dimension_names)

@@ -50,6 +50,14 @@ def read_las_head(path: Path, size: int) -> LasHead:
 
     Raises:
         InputError: no LAS file; a scale or an offset that is nonsense; records or chunks beyond the file's end.
+
+    Examples:
+        >>> import laspy
+        >>> cloud = laspy.create(point_format=6, file_version="1.4")
+        >>> cloud.header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr('LOCAL_CS["site"]'))
+        >>> cloud.write("cloud.las")
+        >>> read_las_head(Path("cloud.las"), Path("cloud.las").stat().st_size).crs
+        FileCrs(wkt='LOCAL_CS["site"]', keys={}, wkt_counts=False, middle=(0.0, 0.0, 0.0))
     """
     with path.open("rb") as stream:
         head = stream.read(_HEADER_BYTES_14)

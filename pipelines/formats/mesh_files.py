@@ -51,7 +51,15 @@ def write_mesh_ply(
 
 
 def read_mesh_ply(path: Path) -> tuple[FloatArray, IntArray]:
-    """Return vertices (V, 3) and faces (F, 3) of a mesh of triangles that this program or COLMAP wrote."""
+    """Return vertices (V, 3) and faces (F, 3) of a mesh of triangles that this program or COLMAP wrote.
+
+    Examples:
+        >>> corners, faces = np.array([[0.0, 0, 7], [1, 0, 7], [0, 1, 7]]), np.array([[0, 1, 2]])
+        >>> write_mesh_ply(Path("mesh.ply"), corners, faces, np.zeros((3, 3), np.uint8), double=False)
+        >>> vertices, faces = read_mesh_ply(Path("mesh.ply"))
+        >>> vertices.tolist(), faces.tolist()
+        ([[0.0, 0.0, 7.0], [1.0, 0.0, 7.0], [0.0, 1.0, 7.0]], [[0, 1, 2]])
+    """
     with path.open("rb") as file:
         header = file.read(_MOST_OF_A_HEADER)
     corners = "vertex_indices" if b" vertex_indices" in header else "vertex_index"

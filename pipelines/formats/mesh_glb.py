@@ -41,6 +41,14 @@ def read_glb_mesh(path: Path) -> TriangleMesh:
 
     Raises:
         InputError: not a glb, without triangles, compressed, with parts in other files, or damaged.
+
+    Examples:
+        >>> from pipelines.formats.mesh_files import write_mesh_glb
+        >>> corners, faces = np.array([[0.0, 0, 7], [1, 0, 7], [0, 1, 7]]), np.array([[0, 1, 2]])
+        >>> grey = np.full((2, 2, 3), 128, np.uint8)
+        >>> write_mesh_glb(Path("one.glb"), corners, faces, corners[:, :2], grey, extras={})
+        >>> read_glb_mesh(Path("one.glb")).vertices.tolist()  # z-up again
+        [[0.0, 0.0, 7.0], [1.0, 0.0, 7.0], [0.0, 1.0, 7.0]]
     """
     size = file_size(path, limit_bytes=MOST_BYTES, kind="glb")
     with reading(path), path.open("rb") as file:

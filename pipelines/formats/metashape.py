@@ -44,6 +44,18 @@ def read_markers_xml(path: Path) -> GroundPoints:
     Raises:
         InputError: unreadable, not well-formed XML, not of Metashape, several chunks, a value that is no number, or
             no marker with coordinates.
+
+    Examples:
+        >>> _ = Path("markers.xml").write_text(
+        ...     '<document><chunk><cameras><camera id="0" label="a.jpg"/></cameras>'
+        ...     '<markers><marker id="0" label="P1"><reference x="7.1" y="46.8" z="498.5"/></marker></markers>'
+        ...     '<frames><frame><markers>'
+        ...     '<marker marker_id="0"><location camera_id="0" x="1210.5" y="733" pinned="true"/></marker>'
+        ...     '</markers></frame></frames></chunk></document>'
+        ... )
+        >>> found = read_markers_xml(Path("markers.xml"))
+        >>> found.points[0].xyz, found.marks[0].image, found.marks[0].x_px
+        ((7.1, 46.8, 498.5), 'a.jpg', 1210.5)
     """
     reader = _Reader(path)
     read_xml(reader, limit_bytes=_MAX_BYTES, kind="file of markers")
@@ -182,10 +194,18 @@ _RESULT = re.compile(r"error|est|variance|var\b|projections", re.IGNORECASE)
 
 
 def read_markers(path: Path) -> GroundPoints:
-    """Read markers without marks; a marker that is not enabled is a check point, as in Metashape.
+    r"""Read markers without marks; a marker that is not enabled is a check point, as in Metashape.
 
     Raises:
         InputError: no header, no rows, a column is missing, a cell is no number, or one point at two places.
+
+    Examples:
+        >>> _ = Path("markers.csv").write_text(
+        ...     '# CoordinateSystem: LOCAL_CS["site"]\n#Label,X,Y,Z,Accuracy\nP1,10,20,498.5,0.02\n'
+        ... )
+        >>> point = read_markers(Path("markers.csv")).points[0]
+        >>> point.xyz, point.sigma_v_m
+        ((10.0, 20.0, 498.5), 0.02)
     """
     table, geographic = _reference(path)
     points = []
@@ -207,10 +227,15 @@ def read_markers(path: Path) -> GroundPoints:
 
 
 def read_cameras(path: Path) -> PoseTable:
-    """Read the positions, and the angles where they are there, of cameras; a label names the image.
+    r"""Read the positions, and the angles where they are there, of cameras; a label names the image.
 
     Raises:
         InputError: no header, no rows, a column is missing, or a cell is no number.
+
+    Examples:
+        >>> _ = Path("cameras.csv").write_text("#Label,X/Longitude,Y/Latitude,Z/Altitude\na.jpg,7.1,46.8,512\n")
+        >>> read_cameras(Path("cameras.csv")).xyz.tolist()  # longitude, latitude, height
+        [[7.1, 46.8, 512.0]]
     """
     table, geographic = _reference(path)
     on = np.array([_is_enabled(row) for row in table.rows])

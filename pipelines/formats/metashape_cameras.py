@@ -71,6 +71,17 @@ def read_metashape(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     Raises:
         InputError: unreadable, not well-formed XML, several chunks, a value that is no number, no aligned
             camera, or what `solved_cameras` refuses.
+
+    Examples:
+        >>> _ = Path("cameras.xml").write_text(
+        ...     '<document><chunk><sensors><sensor id="0" type="frame"><calibration type="frame">'
+        ...     '<resolution width="400" height="300"/><f>350</f></calibration></sensor></sensors>'
+        ...     '<cameras><camera id="0" sensor_id="0" label="a.jpg">'
+        ...     '<transform>1 0 0 2 0 1 0 3 0 0 1 4 0 0 0 1</transform></camera></cameras></chunk></document>'
+        ... )
+        >>> solved = read_metashape(Path("cameras.xml"), lambda name: (400, 300))
+        >>> solved.model.image_name, solved.model.focal_px.tolist()
+        (('a.jpg',), [350.0])
     """
     reader = _Reader(path)
     read_xml(reader, limit_bytes=_MAX_BYTES, kind="file of cameras")

@@ -59,6 +59,15 @@ def read_transforms(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     Raises:
         InputError: unreadable, not of that form, no focal length, an unknown camera model, or what `solved_cameras`
             refuses.
+
+    Examples:
+        >>> import json
+        >>> pose = [[1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 1, 4], [0, 0, 0, 1]]
+        >>> frame = {"file_path": "a.jpg", "transform_matrix": pose}
+        >>> _ = Path("transforms.json").write_text(json.dumps({"fl_x": 350, "w": 400, "h": 300, "frames": [frame]}))
+        >>> solved = read_transforms(Path("transforms.json"), lambda name: (400, 300))
+        >>> solved.model.image_name, solved.model.focal_px.tolist()
+        (('a.jpg',), [350.0])
     """
     document = load_json(_Transforms, path)
     common = _stated(document)

@@ -115,6 +115,16 @@ def read_reconstruction(path: Path, photo_size: PhotoSize) -> SolvedCameras:
 
     Raises:
         InputError: unreadable, not of OpenSfM, an unknown projection, or what `solved_cameras` refuses.
+
+    Examples:
+        >>> import json
+        >>> lens = {"projection_type": "perspective", "width": 400, "height": 300, "focal": 0.875, "k1": 0}
+        >>> shot = {"camera": "v1", "rotation": [0, 0, 0], "translation": [0, 0, 5]}
+        >>> document = [{"cameras": {"v1": lens}, "shots": {"a.jpg": shot}, "points": {}}]
+        >>> _ = Path("reconstruction.json").write_text(json.dumps(document))
+        >>> solved = read_reconstruction(Path("reconstruction.json"), lambda name: (400, 300))
+        >>> solved.model.image_name, solved.model.focal_px.tolist()
+        (('a.jpg',), [350.0])
     """
     models = load_json(_Reconstructions, path).root
     if not models:
@@ -147,6 +157,17 @@ def read_shots(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     Raises:
         InputError: unreadable, not of ODM, no `cameras.json`, several cameras of one size among which nothing
             decides, an unknown projection, or what `solved_cameras` refuses.
+
+    Examples:
+        >>> import json
+        >>> lens = {"projection_type": "perspective", "width": 400, "height": 300, "focal": 0.875, "k1": 0}
+        >>> _ = Path("cameras.json").write_text(json.dumps({"v1": lens}))
+        >>> shot = {"filename": "a.jpg", "camera": "v1", "width": 400, "height": 300}
+        >>> shot |= {"rotation": [0, 0, 0], "translation": [500010, 5180020, 550]}
+        >>> _ = Path("shots.geojson").write_text(json.dumps({"features": [{"properties": shot}]}))
+        >>> solved = read_shots(Path("shots.geojson"), lambda name: (400, 300))
+        >>> solved.model.image_name, solved.model.focal_px.tolist()
+        (('a.jpg',), [350.0])
     """
     shots = [feature.properties for feature in load_json(_Shots, path).features]
     places = (path.with_name(CAMERAS), path.parent.parent / CAMERAS)

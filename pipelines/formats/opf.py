@@ -142,11 +142,23 @@ class _Reference(Foreign):
 
 
 def read_opf(path: Path, photo_size: PhotoSize) -> SolvedCameras:
-    """Read the calibrated cameras of a project, with the tie points of their calibration.
+    r"""Read the calibrated cameras of a project, with the tie points of their calibration.
 
     Raises:
         InputError: unreadable, not of OPF 1.0, files that are missing or outside of the project's folder, no
             calibrated cameras, or what `solved_cameras` refuses.
+
+    Examples:
+        >>> from pipelines.formats.colmap import read_sparse
+        >>> from pipelines.formats.opf_writer import OpfFrame, OpfPhotograph, OpfScene, write_opf
+        >>> _ = Path("cameras.txt").write_text("1 PINHOLE 400 300 350 350 200 150\n")
+        >>> _ = Path("images.txt").write_text("1 1 0 0 0 0 0 5 1 a.jpg\n\n")
+        >>> Path("points3D.txt").touch()
+        >>> frame = OpfFrame("EPSG:4979", shift=np.zeros(3))
+        >>> _ = write_opf(Path(), OpfScene("flight", frame, read_sparse(Path()), [OpfPhotograph("a.jpg")], []))
+        >>> solved = read_opf(Path("project.opf"), lambda name: (400, 300))
+        >>> solved.model.image_name, solved.model.focal_px.tolist()
+        (('a.jpg',), [350.0])
     """
     project = _project(path)
     calibration, item, remarks = _calibration(project, path)
@@ -185,11 +197,25 @@ def has_tracks(path: Path) -> bool:
 
 
 def read_opf_points(path: Path) -> GroundPoints:
-    """Read the control points that were given to a project, with their marks; manual tie points are left out.
+    r"""Read the control points that were given to a project, with their marks; manual tie points are left out.
 
     Raises:
         InputError: unreadable, not of OPF 1.0, no control point, several CRSs, a height above a geoid of which only
             its own height is stated, or one point at two places.
+
+    Examples:
+        >>> from pipelines.formats.colmap import read_sparse
+        >>> from pipelines.formats.opf_writer import OpfFrame, OpfPhotograph, OpfPoint, OpfScene, write_opf
+        >>> _ = Path("cameras.txt").write_text("1 PINHOLE 400 300 350 350 200 150\n")
+        >>> _ = Path("images.txt").write_text("1 1 0 0 0 0 0 5 1 a.jpg\n\n")
+        >>> Path("points3D.txt").touch()
+        >>> frame, photographs = OpfFrame("EPSG:4979", shift=np.zeros(3), swap_xy=True), [OpfPhotograph("a.jpg")]
+        >>> xyz, sigma, marks = np.array([7.1, 46.8, 498.5]), np.full(3, 0.02), (("a.jpg", 210.5, 133.0, 0.5),)
+        >>> points = [OpfPoint("P1", is_check=False, xyz=xyz, sigma=sigma, marks=marks)]
+        >>> _ = write_opf(Path(), OpfScene("flight", frame, read_sparse(Path()), photographs, points))
+        >>> found = read_opf_points(Path("project.opf"))
+        >>> found.points[0].xyz, found.in_order_of_crs, found.marks[0].x_px
+        ((46.8, 7.1, 498.5), True, 210.5)
     """
     project = _project(path)
     names = _photographs(project, path)

@@ -97,12 +97,27 @@ class _Gltf(_Part):
 def read_tracks(
     path: Path, photograph_of: Mapping[int, int], beside: Callable[[str, Path], Path]
 ) -> TiePoints | None:
-    """Read the points of all nodes with their matches; None: no node has matches with pixels.
+    r"""Read the points of all nodes with their matches; None: no node has matches with pixels.
 
     `photograph_of` gives the photograph by UID of its camera, and `beside` the path of a URI in a file.
 
     Raises:
         InputError: unreadable, not glTF, or indices, ranges and sizes that do not fit each other.
+
+    Examples:
+        >>> from pipelines.formats.colmap import read_sparse
+        >>> from pipelines.formats.opf_writer import OpfFrame, OpfPhotograph, OpfScene, uid_of, write_opf
+        >>> _ = Path("cameras.txt").write_text("1 PINHOLE 400 300 350 350 200 150\n")
+        >>> images = "1 1 0 0 0 0 0 5 1 a.jpg\n235 150 1\n2 1 0 0 0 -1 0 5 1 b.jpg\n165 150 1\n"
+        >>> _ = Path("images.txt").write_text(images)
+        >>> _ = Path("points3D.txt").write_text("1 0.5 0 0 90 90 90 0.1 1 0 2 0\n")
+        >>> frame = OpfFrame("EPSG:4979", shift=np.zeros(3))
+        >>> photographs = [OpfPhotograph("a.jpg"), OpfPhotograph("b.jpg")]
+        >>> _ = write_opf(Path(), OpfScene("flight", frame, read_sparse(Path()), photographs, []))
+        >>> number = {uid_of("a.jpg"): 0, uid_of("b.jpg"): 1}
+        >>> ties = read_tracks(Path("tracks.gltf"), number, lambda uri, file: file.with_name(uri))
+        >>> ties.position.tolist(), ties.obs_photograph.tolist(), ties.obs_xy_px.tolist()
+        ([[0.5, 0.0, 0.0]], [0, 1], [[235.0, 150.0], [165.0, 150.0]])
     """
     file = _File(path, load_json(_Gltf, path), beside)
     parts = []

@@ -47,10 +47,19 @@ def header_line(lines: list[tuple[int, str]]) -> tuple[int, str] | None:
 
 
 def read_camera_csv(path: Path, photo_size: PhotoSize) -> SolvedCameras:
-    """Read the cameras of a table; the photographs' own sizes make pixels of its shares.
+    r"""Read the cameras of a table; the photographs' own sizes make pixels of its shares.
 
     Raises:
         InputError: no such header, a column is missing, a cell is no number, or what `solved_cameras` refuses.
+
+    Examples:
+        >>> _ = Path("cameras.csv").write_text(
+        ...     "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+        ...     "a.jpg,10,20,50,0,0,0,31.5,0,0,0,0,0,0,0,0\n"
+        ... )
+        >>> solved = read_camera_csv(Path("cameras.csv"), lambda name: (400, 300))
+        >>> solved.model.image_name, solved.model.focal_px.tolist()
+        (('a.jpg',), [350.0])
     """
     lines = tables.numbered_lines(path)
     found = header_line(lines)

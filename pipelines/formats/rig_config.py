@@ -56,8 +56,8 @@ def read_rig_config(path: Path) -> tuple[RigConfig, ...]:
         >>> import json
         >>> cameras = [{"image_prefix": "left/", "ref_sensor": True}, {"image_prefix": "right/"}]
         >>> _ = Path("rig.json").write_text(json.dumps([{"cameras": cameras}]))
-        >>> len(read_rig_config(Path("rig.json")))
-        1
+        >>> read_rig_config(Path("rig.json"))[0].lenses[1]
+        RigLens(prefix='right/', quat_xyzw=None)
     """
     rigs = load_json(_Rigs, path).root
     if not rigs:

@@ -97,6 +97,14 @@ def read_splat_ply(path: Path, rows: slice = slice(None)) -> SplatArrays:
 
     Raises:
         InputError: no such file, not a PLY of that form, cut off, or with values that are not finite.
+
+    Examples:
+        >>> shapes = (1, 3), (1, 4), (1, 3), (1,), (1, 1, 3)  # mean, rotation, ln σ, logit of opacity, harmonics
+        >>> splat = SplatArrays(*(np.ones(shape, np.float32) for shape in shapes))
+        >>> write_splat_ply(Path("splat.ply"), splat)
+        >>> read = read_splat_ply(Path("splat.ply"))
+        >>> read.means.tolist(), read.log_scales.tolist()
+        ([[1.0, 1.0, 1.0]], [[1.0, 1.0, 1.0]])
     """
     ply = _read_rows(path, rows)
     rest_count = sum(name.startswith("f_rest_") for name in ply.names)
@@ -117,12 +125,28 @@ def read_splat_ply(path: Path, rows: slice = slice(None)) -> SplatArrays:
 
 
 def read_centres(path: Path) -> Float32Array:
-    """Read the centres (N, 3) of Gaussians alone, as `read_splat_ply`: the other properties stay unread."""
+    """Read the centres (N, 3) of Gaussians alone, as `read_splat_ply`: the other properties stay unread.
+
+    Examples:
+        >>> shapes = (1, 3), (1, 4), (1, 3), (1,), (1, 1, 3)  # mean, rotation, ln σ, logit of opacity, harmonics
+        >>> splat = SplatArrays(*(np.ones(shape, np.float32) for shape in shapes))
+        >>> write_splat_ply(Path("splat.ply"), splat)
+        >>> read_centres(Path("splat.ply")).tolist()
+        [[1.0, 1.0, 1.0]]
+    """
     return _columns(_read_rows(path), _POSITION)
 
 
 def read_logit_opacities(path: Path) -> Float32Array:
-    """Read the logits (N,) of the opacities of Gaussians alone, as `read_splat_ply`."""
+    """Read the logits (N,) of the opacities of Gaussians alone, as `read_splat_ply`.
+
+    Examples:
+        >>> shapes = (1, 3), (1, 4), (1, 3), (1,), (1, 1, 3)  # mean, rotation, ln σ, logit of opacity, harmonics
+        >>> splat = SplatArrays(*(np.ones(shape, np.float32) for shape in shapes))
+        >>> write_splat_ply(Path("splat.ply"), splat)
+        >>> read_logit_opacities(Path("splat.ply")).tolist()
+        [1.0]
+    """
     return _columns(_read_rows(path), ("opacity",))[:, 0]
 
 

@@ -163,6 +163,12 @@ def decode_spz(data: bytes, path: Path | None = None) -> SplatArrays:
     Raises:
         InputError: not an SPZ file of that form, cut off, with other axes than right, up, back, or one that would
             unpack to more than sixteen times its size (and 16 MiB); names the path.
+
+    Examples:
+        >>> shapes = (1, 3), (1, 4), (1, 3), (1,), (1, 1, 3)  # mean, rotation, ln σ, logit of opacity, harmonics
+        >>> splat = SplatArrays(*(np.ones(shape, np.float32) for shape in shapes))
+        >>> decode_spz(encode_spz(splat)).means.tolist()
+        [[1.0, 1.0, 1.0]]
     """
     layout, body, _ = _unpacked(data, path)
     return _dequantised(layout, body)

@@ -60,13 +60,18 @@ def plain_text(cell: str) -> str:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file, without byte order mark and line ends (LF, CRLF or CR).
+    r"""Return the lines of a text file, without byte order mark and line ends (LF, CRLF or CR).
 
     The text is UTF-8, or UTF-16 where its byte order mark says so, as spreadsheets save "Unicode text".
 
     Raises:
         InputError: missing, a folder, larger than 128 MiB, of more than a million lines, with a line of more than
             64 KiB, empty, or not UTF-8.
+
+    Examples:
+        >>> _ = Path("points.txt").write_text("P1;10\r\nP2;20\r\n", encoding="utf-16")
+        >>> read_lines(Path("points.txt"))
+        ['P1;10', 'P2;20']
     """
     lines: list[str] = []
     file_size(path, limit_bytes=MAX_BYTES, kind="text table")

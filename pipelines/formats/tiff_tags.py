@@ -61,6 +61,12 @@ def read_directory(
     """Return the tags of the directory at an offset, of the first one without it; all tags, or those wanted.
 
     Tags of an unknown type, beyond the block's end or longer than `limit_bytes` are left out. Nothing is raised.
+
+    Examples:
+        >>> entry = struct.pack("<HHII", 0x0112, 3, 1, 6)  # Orientation, a short, one value
+        >>> block = b"II" + struct.pack("<HIH", 42, 8, 1) + entry + bytes(4)
+        >>> {tag: value.fractions for tag, value in read_directory(block).items()}
+        {274: ((6, 1),)}
     """
     if block[:4] not in TIFF:
         return {}

@@ -57,10 +57,20 @@ def has_faces(path: Path) -> bool:
 
 
 def read_ply_mesh(path: Path) -> TriangleMesh:
-    """Return the triangles of a PLY, binary or ASCII.
+    r"""Return the triangles of a PLY, binary or ASCII.
 
     Raises:
         InputError: not a PLY of faces, coordinates of too little precision, cut off or damaged.
+
+    Examples:
+        >>> _ = Path("one.ply").write_text(
+        ...     "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        ...     "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        ...     "0 0 7\n1 0 7\n0 1 7\n3 0 1 2\n"
+        ... )
+        >>> mesh = read_ply_mesh(Path("one.ply"))
+        >>> mesh.vertices.tolist(), mesh.faces.tolist()
+        ([[0.0, 0.0, 7.0], [1.0, 0.0, 7.0], [0.0, 1.0, 7.0]], [[0, 1, 2]])
     """
     cloud = open_cloud_ply(path)
     chunks = [chunk.position for chunk in cloud.chunks(1_000_000)]
@@ -190,9 +200,10 @@ def read_obj(path: Path) -> TriangleMesh:
     r"""Return the triangles of an OBJ; an InputError: too large, no faces, or a line that is none of OBJ.
 
     Examples:
-        >>> _ = Path("one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-        >>> len(read_obj(Path("one.obj")).faces)
-        1
+        >>> _ = Path("one.obj").write_text("v 0 0 7\nv 1 0 7\nv 0 1 7\nf 1 2 3\n")
+        >>> mesh = read_obj(Path("one.obj"))
+        >>> mesh.vertices.tolist(), mesh.faces.tolist()
+        ([[0.0, 0.0, 7.0], [1.0, 0.0, 7.0], [0.0, 1.0, 7.0]], [[0, 1, 2]])
     """
     if file_size(path, limit_bytes=MOST_BYTES, kind="OBJ") == 0:
         raise InputError("file-empty", "The file is empty.", path=path)

@@ -185,7 +185,15 @@ def column_names(names: Sequence[str]) -> list[str]:
 
 
 def read_contours(path: Path) -> tuple[str, list[ContourLine]]:
-    """Return the CRS as WKT and the lines of a file that `write_contours_gpkg` wrote; an InputError: damaged."""
+    """Return the CRS as WKT and the lines of a file that `write_contours_gpkg` wrote; an InputError: damaged.
+
+    Examples:
+        >>> lines = [ContourLine(height=500.0, xy=np.array([[7.0, 46.0], [7.1, 46.2]]), is_major=True)]
+        >>> write_contours_gpkg(Path("contours.gpkg"), lines, "EPSG:4326")
+        >>> crs, read = read_contours(Path("contours.gpkg"))
+        >>> read[0].height, read[0].xy.tolist()
+        (500.0, [[7.0, 46.0], [7.1, 46.2]])
+    """
     wkt, shapes, rows = _read_gpkg(path, "contours", ("height", "major"), "georef export-raster --contours")
     lines = [
         ContourLine(float(height), shapely.get_coordinates(shape), bool(major))
@@ -200,6 +208,13 @@ def read_regions(
     """Return the CRS as WKT, polygons and some columns of the regions of `georef change`, as `read_contours`.
 
     `doubtful`: of the layer of regions that count as no change.
+
+    Examples:
+        >>> layers = {"regions": ([shapely.box(0, 0, 10, 10)], [{"name": "R1", "net_m3": -25.0}])}
+        >>> write_polygons_gpkg(Path("regions.gpkg"), layers, "EPSG:32632")
+        >>> crs, polygons, rows = read_regions(Path("regions.gpkg"), ["name", "net_m3"])
+        >>> polygons[0].area, rows  # the area in m²
+        (100.0, [('R1', -25.0)])
     """
     return _read_gpkg(path, "doubtful" if doubtful else "regions", columns, "georef change")
 
@@ -273,7 +288,15 @@ class ReadLayer:
 
 
 def read_layers(path: Path, columns: Sequence[str] = (), *, field: str) -> list[ReadLayer]:
-    """Return the layers with geometry of a GeoPackage or DXF file; an InputError names file and option."""
+    """Return the layers with geometry of a GeoPackage or DXF file; an InputError names file and option.
+
+    Examples:
+        >>> lines = [ContourLine(height=500.0, xy=np.array([[7.0, 46.0], [7.1, 46.2]]), is_major=True)]
+        >>> write_contours_gpkg(Path("contours.gpkg"), lines, "EPSG:4326")
+        >>> layer = read_layers(Path("contours.gpkg"), ["height"], field="--boundary")[0]
+        >>> layer.name, layer.shapes[0].wkt, layer.values["height"].tolist()
+        ('contours', 'LINESTRING (7 46, 7.1 46.2)', [500.0])
+    """
     layers = []
     try:
         with warnings.catch_warnings(), tables_alone(path, field=field) as source:

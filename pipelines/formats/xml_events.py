@@ -70,6 +70,15 @@ def read_xml(reader: XmlReader, *, limit_bytes: int, kind: str) -> None:
 
     Raises:
         InputError: unreadable, too large for its kind, not well-formed XML, or what the reader refuses.
+
+    Examples:
+        >>> class Labels(XmlReader):
+        ...     def begin(self, name, values, parent):
+        ...         print(self.open, values)
+        >>> _ = Path("markers.xml").write_text('<document><marker label="P1"/></document>')
+        >>> read_xml(Labels(Path("markers.xml")), limit_bytes=1000, kind="file of markers")
+        ['document'] {}
+        ['document', 'marker'] {'label': 'P1'}
     """
     from defusedxml.common import DefusedXmlException
     from defusedxml.sax import make_parser

@@ -100,7 +100,16 @@ def number_of(text: str) -> float | None:
 
 
 def read_packets(packets: Iterable[bytes], problems: list[str]) -> Xmp:
-    """Return the properties of packets; those that cannot be read are added to the problems."""
+    """Return the properties of packets; those that cannot be read are added to the problems.
+
+    Examples:
+        >>> packet = (
+        ...     b'<r:RDF xmlns:r="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><r:Description '
+        ...     b'xmlns:d="http://www.dji.com/drone-dji/1.0/" d:RelativeAltitude="+50.00" d:RtkFlag="50"/></r:RDF>'
+        ... )
+        >>> read_packets([packet], []).number("RelativeAltitude")  # metres above the take-off
+        50.0
+    """
     properties: list[XmpProperty] = []
     for packet in packets:
         try:
@@ -116,6 +125,14 @@ def read_packet(packet: bytes) -> list[XmpProperty]:
 
     Raises:
         XmpError: a packet that is too long or not well formed.
+
+    Examples:
+        >>> packet = (
+        ...     b'<r:RDF xmlns:r="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><r:Description '
+        ...     b'xmlns:d="http://www.dji.com/drone-dji/1.0/" d:RelativeAltitude="+50.00" d:RtkFlag="50"/></r:RDF>'
+        ... )
+        >>> [(one.name, one.text) for one in read_packet(packet)]
+        [('RelativeAltitude', '+50.00'), ('RtkFlag', '50')]
     """
     from defusedxml.common import DefusedXmlException
     from defusedxml.ElementTree import fromstring
