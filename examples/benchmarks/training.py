@@ -264,8 +264,8 @@ def georeference(arguments: argparse.Namespace) -> None:
 def placed(root: Path, trainer: JointTrainer, options: TrainOptions) -> list[float]:
     """Return `FIGURES` after the first: check points, triangulated, motion of the cameras, χ² of the motion.
 
-    H and V are RMSE. The motion since `init-sim3`, in `geo`, is the root mean square over the cameras beside their
-    mean, the largest of all, and that mean. Its χ² is what it costs all measurements.
+    H and V are RMSE, NaN without check points. The motion since `init-sim3`, in `geo`, is the root mean square over
+    the cameras beside their mean, the largest of all, and that mean. Its χ² is what it costs all measurements.
     """
     solution, survey, scene = load_adjusted_scene(Workspace(root))
     model, unknowns = solution, trainer.problem.unknowns
@@ -273,9 +273,10 @@ def placed(root: Path, trainer: JointTrainer, options: TrainOptions) -> list[flo
         measured = measured_problem(solution, survey, scene, control_points=options.gcp_loss)
         model = solved_at(solution, survey, scene, measured, unknowns.state()).solution
     rays = mark_rays(survey.check_points, model.with_lenses(scene.sparse))
-    surveyed = np.array([point.position_in_geo for point in survey.check_points])
+    surveyed = np.array([point.position_in_geo for point in survey.check_points]).reshape(-1, 3)
     error = triangulated_points(model, rays) - surveyed
-    error = error[np.isfinite(error).all(axis=1)]
+    seen = np.isfinite(error).all(axis=1)
+    error = error[seen] if seen.any() else np.full((1, 3), np.nan)
     moved = model.center_in_geo - solution.center_in_geo
     own = np.linalg.norm(moved - moved.mean(axis=0), axis=1)
     lengths_m = (
