@@ -8,6 +8,8 @@ The CRS is written as WKT1 in GDAL's dialect: LAS 1.4 predates WKT2, which reade
 
 from __future__ import annotations
 
+import io
+import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +24,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.types import BoolArray, ByteArray, FloatArray
 from pipelines.formats.cloud_ply import CloudChunk, CloudPoints
-from pipelines.formats.las_head import InOrder, LasHead, read_las_head
+from pipelines.formats.las_head import LasHead, read_las_head
 from pipelines.geodesy.geotiff_keys import FileCrs
 
 if TYPE_CHECKING:
@@ -47,6 +49,7 @@ _COVARIANCE = {  # name of each element of the upper triangle, with its row and 
 }
 _ANGLE_STEP_DEG = 0.006
 _POINT_BITS_LEAST = 0.05  # LAZ spends more on each point, even on equal ones
+_GAP = 1 << 20  # bytes between a file's end and the table of chunks that stands for its missing one
 _OVERLAP_CLASS = 12  # of the point formats 0 to 5, which have no flag for it
 
 
@@ -103,10 +106,54 @@ def open_las(path: Path) -> LasFile:
             return LasFile(path, count, head)
 
 
+class _InOrder(io.RawIOBase):
+    """LAZ file whose table of chunks was never written, with an empty table far behind its end.
+
+    The decoder then reads chunk after chunk. Between the file's end and the table lies nothing, so that points
+    which are cut off are an error, not zeros.
+    """
+
+    def __init__(self, path: Path, size: int, table_at: int) -> None:
+        self._file, self._size = path.open("rb"), size
+        table = size + _GAP
+        self._parts = ((table_at, struct.pack("<q", table)), (table, bytes(8)))
+        self._place = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._place
+
+    def seek(self, place: int, whence: int = io.SEEK_SET) -> int:
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._parts[1][0] + 8}[whence]
+        self._place = max(base + place, 0)
+        return self._place
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        start = self._place
+        self._file.seek(start)
+        data = bytearray(self._file.read(min(len(buffer), max(self._size - start, 0))))
+        for at, part in self._parts:
+            first, last = max(at, start), min(at + len(part), start + len(buffer))
+            if first < last and first - start <= len(data):
+                data[first - start : last - start] = part[first - at : last - at]
+        buffer[: len(data)] = data
+        self._place += len(data)
+        return len(data)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
 def _opened(path: Path, head: LasHead) -> laspy.LasReader:
     import laspy
 
-    source = path if head.table_at is None else InOrder(path, file_size(path), head.table_at)
+    source = path if head.table_at is None else _InOrder(path, file_size(path), head.table_at)
     # This decoder holds one chunk at a time, where the parallel one holds many.
     return laspy.open(source, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs)
 

@@ -6,7 +6,6 @@ scales and offsets must be numbers that can place points.
 
 from __future__ import annotations
 
-import io
 import math
 import re
 import struct
@@ -31,12 +30,11 @@ _LOCAL = re.compile(r"LOCAL_CS|ENGCRS|ENGINEERINGCRS", re.IGNORECASE)
 _KEYS, _DOUBLES, _TEXTS = 34735, 34736, 34737  # of GeoTIFF
 _USERS = ("lasf_projection", "liblas", "pdal")
 _POINTWISE, _VARIABLE_CHUNKS = 1, 0xFFFFFFFF
-_GAP = 1 << 20  # bytes between a file's end and the table that stands for its missing one
 
 
 @dataclass(frozen=True)
 class LasHead:
-    """What the head of a file says, checked.
+    """Checked statements of the head of a file.
 
     `table_at` is the place of the pointer to the table of compressed chunks, if that table was never written.
     """
@@ -186,47 +184,3 @@ def _missing_table(path: Path, stream: BinaryIO, offset: int, size: int, found: 
         message = "The table of its chunks, which have different lengths, was never written: no reader finds them."
         raise InputError("file-cut-off", message, path=path)
     return offset
-
-
-class InOrder(io.RawIOBase):
-    """LAZ file whose table of chunks was never written, with an empty table far behind its end.
-
-    The decoder then reads chunk after chunk. Between the file's end and the table lies nothing, so that points
-    which are cut off are an error, not zeros.
-    """
-
-    def __init__(self, path: Path, size: int, table_at: int) -> None:
-        self._file, self._size = path.open("rb"), size
-        table = size + _GAP
-        self._parts = ((table_at, struct.pack("<q", table)), (table, bytes(8)))
-        self._place = 0
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._place
-
-    def seek(self, place: int, whence: int = io.SEEK_SET) -> int:
-        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._parts[1][0] + 8}[whence]
-        self._place = max(base + place, 0)
-        return self._place
-
-    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        start = self._place
-        self._file.seek(start)
-        data = bytearray(self._file.read(min(len(buffer), max(self._size - start, 0))))
-        for at, part in self._parts:
-            first, last = max(at, start), min(at + len(part), start + len(buffer))
-            if first < last and first - start <= len(data):
-                data[first - start : last - start] = part[first - at : last - at]
-        buffer[: len(data)] = data
-        self._place += len(data)
-        return len(data)
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
