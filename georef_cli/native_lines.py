@@ -1,4 +1,4 @@
-"""What libraries write to standard error by themselves, as records of the log.
+"""Lines that libraries write to standard error by themselves, as records of the log.
 
 OpenCV, libtiff, libpng, GDAL, glog and OpenMP write to file descriptor 2 and know no `sys.stderr`. That descriptor
 becomes a pipe whose lines are logged, and standard error belongs to this program alone: with `--json-progress` each

@@ -25,8 +25,9 @@ from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.staleness import StageState
 from pipelines.core.workspace import Workspace
 from pipelines.survey.headline import PointLine, point_lines
+from pipelines.survey.lidar_report import HeldOutDepths
+from pipelines.survey.reference_comparison import ReferenceComparison
 from pipelines.survey.report import CheckPointErrors, EvaluationReport, read_report
-from pipelines.survey.report_parts import HeldOutDepths, ReferenceComparison
 
 
 class FirstThatFits:

@@ -23,10 +23,11 @@ from pipelines.core.sentences import about
 from pipelines.core.staleness import Flags, must_exist, stage_config
 from pipelines.core.workspace import Workspace
 from pipelines.survey.report import read_report
-from pipelines.survey.survey import RigCalibration, Survey
+from pipelines.survey.survey import Survey
 
 if TYPE_CHECKING:
     from pipelines.survey.block_plan import BlockPlan
+    from pipelines.survey.navigation import RigCalibration
     from pipelines.train.blocks.parts import Parts
 
 
@@ -78,6 +79,8 @@ _COMPONENTS = {"boresight": ("x", "y", "z"), "lever-arm": ("forward", "right", "
 def _calibrated(workspace: Workspace, values: Mapping[str, Any]) -> tuple[RenderableType, ...]:
     if values["as_json"]:
         return ()
+    from pipelines.survey.navigation import RigCalibration
+
     calibration = load_json(RigCalibration, workspace.path(stages.RIG))
     if not calibration.estimates:
         return ()

@@ -28,18 +28,15 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.navigation import (
     FIX_LAG,
     FIX_LAG_OPEN,
+    FixLag,
     NavigationTrack,
+    RigCalibration,
+    RigEstimate,
     apply_calibration,
     load_track,
     shown_by,
 )
-from pipelines.survey.survey import (
-    FixLag,
-    RigCalibration,
-    RigEstimate,
-    RigParameter,
-    Survey,
-)
+from pipelines.survey.survey import RigParameter, Survey
 
 # A parameter without any information has an infinite σ, which JSON cannot hold.
 _ENDLESS = 1e6

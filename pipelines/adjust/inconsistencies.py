@@ -41,7 +41,7 @@ from pipelines.geodesy.vertical import FOOT_M, MOST_GEOID_M
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import median_spacing, outlier_gate, typical_sigma
-from pipelines.survey.report_parts import EstimatedError, Group, VarianceFactor
+from pipelines.survey.measurement_errors import EstimatedError, Group, VarianceFactor
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
 

@@ -27,6 +27,7 @@ from pipelines.adjust.alignment import (
     covariance_of,
     layout_of,
 )
+from pipelines.adjust.earlier_date import cautions_of_common, outliers_in_common, start_at_common
 from pipelines.adjust.fix_patterns import pattern_of
 from pipelines.adjust.inconsistencies import (
     arm_caution,
@@ -54,7 +55,6 @@ from pipelines.adjust.posterior import Posterior, save_posterior
 from pipelines.adjust.solution import adjusted, remarks_of
 from pipelines.adjust.system import Linearised, minimise
 from pipelines.adjust.terms import ControlPoints, Distances, Fixes
-from pipelines.adjust.tied import cautions_of_common, outliers_in_common, start_at_common
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError, InconsistencyError, InputError
 from pipelines.core.products import NOT_CHECKED, Remark, save_json, union
 from pipelines.core.sentences import listed

@@ -30,7 +30,7 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import chi2_probability_above, median_chi2, outlier_gate
 from pipelines.survey.marks import RayErrors, intersect_marks, mark_angles, mark_rays
-from pipelines.survey.report_parts import (
+from pipelines.survey.measurement_errors import (
     EstimatedError,
     Group,
     SigmaSource,
@@ -63,7 +63,7 @@ _NO_REDUNDANCY = 0.5
 
 @dataclass(frozen=True)
 class Consistency:
-    """What the measurements of an adjustment say of each other at its minimum."""
+    """Consistency of the measurements of an adjustment with each other, at its minimum."""
 
     used: dict[str, BoolArray]  # by kind of observation: mask (M,) of those that agree
     factors: dict[Group, VarianceFactor]

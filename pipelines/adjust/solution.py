@@ -19,8 +19,8 @@ from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import covariance_root
+from pipelines.survey.measurement_errors import EstimatedError
 from pipelines.survey.report import AccuracySummary
-from pipelines.survey.report_parts import EstimatedError
 from pipelines.survey.scene import Scene
 from pipelines.survey.solution import (
     Measurement,

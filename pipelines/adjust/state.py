@@ -9,7 +9,7 @@ from pipelines.core.types import BoolArray, FloatArray
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
-from pipelines.survey.report_parts import EstimatedError
+from pipelines.survey.measurement_errors import EstimatedError
 
 # Priors of lever arm and boresight, in the adjustment and in the search for its start: wider than any error of a
 # mounting, and finite, so that what a flight leaves open shows by its σ. Wider ones would change no observed value

@@ -67,7 +67,7 @@ def load_epoch(workspace: Workspace) -> Epoch:
 
 @dataclass(frozen=True)
 class Shared:
-    """What two epochs share: variance (3,) east, north, up in m² by source, and the names of the control points.
+    """Errors that two epochs share: variance (3,) east, north, up in m² by source, and names of control points.
 
     `by_system_m2` is that of one reference system with one assumption or transformation, which the difference is
     free of.

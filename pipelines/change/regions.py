@@ -175,10 +175,10 @@ def find_regions(
     )
 
 
-def without(
+def without_doubtful(
     found: FoundRegions, doubtful: Collection[int], reason: str, noise: Noise, cell_m2: float
 ) -> tuple[FoundRegions, DoubtfulRegions]:
-    """Return regions without those at some places of `found`, and these, which count as no change for a reason."""
+    """Return the regions that count, and those at some places of `found`, which do not, for a reason."""
     out = sorted(doubtful)
     kept = [place for place in range(len(found.regions)) if place not in doubtful]
     moved = np.zeros(len(found.regions) + 1, dtype=np.int32)

@@ -15,7 +15,6 @@ import shapely
 from numpy.typing import NDArray
 
 from pipelines.change.along_normals import Datum, change_along_normals, require_clouds
-from pipelines.change.by_date import Ground, volumes_by_date
 from pipelines.change.datum import Epoch, load_epoch, same_photographs, shared_by
 from pipelines.change.detection import (
     QUANTILE_95,
@@ -35,8 +34,16 @@ from pipelines.change.grid import (
 )
 from pipelines.change.options import ChangeOptions
 from pipelines.change.page import Compared, change_page
-from pipelines.change.regions import DoubtfulRegions, FoundRegions, RasterParts, find_regions, reach_of, without
+from pipelines.change.regions import (
+    DoubtfulRegions,
+    FoundRegions,
+    RasterParts,
+    find_regions,
+    reach_of,
+    without_doubtful,
+)
 from pipelines.change.tied import Contradicted, Surfaces, Tied, contradicted, tied_by
+from pipelines.change.volumes_by_date import Ground, volumes_by_date
 from pipelines.core.errors import InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import Remark, save_json, union
@@ -103,7 +110,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     sign, median_lod_m = _write_rasters(stage, parts, noise, registered=registered)
     given = _polygons(options.regions, "--regions", after, options) or ()
     found = find_regions(parts, sign, noise, given, options.min_area)
-    found, doubtful, partly = _without_doubtful(found, tied, noise, parts)
+    found, doubtful, partly = _counted(found, tied, noise, parts)
     _write_significant(stage.out, parts, found.sign, doubtful.inside)
     moved = None
     if options.along_normals:
@@ -312,7 +319,7 @@ def _write_mosaic(folder: Path, parts: RasterParts, name: str) -> None:
     write_mosaic(folder / f"{name}.tif", places, parts.grid.frame, _KINDS[name], {})
 
 
-def _without_doubtful(
+def _counted(
     found: FoundRegions, tied: Tied | None, noise: Noise, parts: RasterParts
 ) -> tuple[FoundRegions, DoubtfulRegions, list[str]]:
     """Return the regions that count, those that points in common contradict, and the names of those in a part."""
@@ -322,7 +329,7 @@ def _without_doubtful(
         surfaces = Surfaces(grid.crs, risen_m, noise.length_m)
         contradicts = contradicted(tied, found.regions, found.polygons, surfaces)
     kept = [place for place in range(len(found.regions)) if place not in contradicts.whole]
-    left, doubtful = without(found, contradicts.whole, DOUBTED, noise, grid.cell_m2)
+    left, doubtful = without_doubtful(found, contradicts.whole, DOUBTED, noise, grid.cell_m2)
     partly = [one.name for one, place in zip(left.regions, kept, strict=True) if place in contradicts.part]
     return left, doubtful, partly
 

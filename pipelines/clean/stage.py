@@ -61,7 +61,7 @@ _TOLERATED_DB = 0.1  # that the removal of floaters may cost before it is said
 
 
 class Cleaning(Product):
-    """What `georef clean` has done.
+    """Record of `georef clean`: numbers of Gaussians, and the quality before and after.
 
     Attributes:
         trained, cleaned: numbers of Gaussians.

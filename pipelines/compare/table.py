@@ -10,7 +10,7 @@ from pipelines.core.files import replace_text
 from pipelines.core.products import Product, Remark
 from pipelines.report.page import Page, Section, png_file, render_page
 from pipelines.report.plots.charts import BarChart, write_bars
-from pipelines.survey.report_parts import ReferenceComparison
+from pipelines.survey.reference_comparison import ReferenceComparison
 
 # Errors of the check points that the table shows: the way of measuring (key of `WAYS`), field of `PointAccuracy`.
 POINT_FIGURES = (

@@ -57,6 +57,8 @@ class MessageSender:
 
 
 class SentRecords(logging.Handler):
+    """Log handler that sends records to the process that has started this one."""
+
     def __init__(self, sender: MessageSender) -> None:
         super().__init__()
         self._sender = sender

@@ -74,7 +74,7 @@ ERRORS = {
     "max_3d_m": Figure("max 3D", "largest error in three dimensions"),
 }
 # Errors of the surface at measured points that the training was not given, by field of
-# `survey.report_parts.DepthErrors`.
+# `survey.lidar_report.DepthErrors`.
 DEPTH_ERRORS = {
     "points": Figure("points", "held-out measured points at which both surfaces are known", "", 0),
     "bias_m": Figure("bias", "median error along the points' normals; above zero: in front of the points"),

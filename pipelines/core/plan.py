@@ -52,7 +52,7 @@ def option_origins(workspace: Workspace, spec: StageSpec, flags: Flags | None = 
 
 @dataclass(frozen=True)
 class PlannedStage:
-    """What a run would do with a stage, and why; its changed options, and all of them.
+    """Plan of a run for a stage, with its reason; the stage's changed options, and all of them.
 
     The action `perhaps`: it runs, unless the stages before it give the same products as before.
     """

@@ -184,7 +184,7 @@ def why_damaged(files: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Finding:
-    """What lies in the folder of a stage.
+    """Content of the folder of a stage.
 
     Attributes:
         manifest: None: there is none that can be read.

@@ -87,7 +87,7 @@ class Recent(Generic[Picture]):
 
 
 class Pictures(Protocol):
-    """What the views show, in C channels."""
+    """Colours that the views show, in C channels."""
 
     @property
     def moved(self) -> Float32Array:
@@ -145,7 +145,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _Light:
-    """What undoes a photograph's light.
+    """Correction of a photograph's light.
 
     `colour_of` (3, 4) applies to homogeneous colours of 0 … 255; the vignetting divides what it gives.
     """

@@ -57,7 +57,7 @@ _WRONG = 0.1  # share of the heights of the model alone that are wrong, by three
 
 @dataclass(frozen=True)
 class SeenCells:
-    """What is measured in a window and up to `REACH` cells around it (H, W).
+    """Measured cells of a window, and of up to `REACH` cells around it (H, W).
 
     Attributes:
         frame: of these cells.

@@ -243,7 +243,7 @@ _HAZE_VIEWS = 2  # training views that look through a Gaussian, and none that sh
 
 @dataclass(frozen=True)
 class RasterSource:
-    """What the windows of the rasters are made from.
+    """Sources of the windows of the rasters.
 
     Attributes:
         splats, level: Gaussians over the plane, and the height above them that their depths count from.

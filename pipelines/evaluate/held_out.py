@@ -5,8 +5,7 @@ import numpy as np
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import FloatArray
 from pipelines.surface.surface_views import ModelRenderer
-from pipelines.survey.held_out import HeldOutPoints
-from pipelines.survey.report_parts import DepthErrors, HeldOutDepths
+from pipelines.survey.lidar_report import DepthErrors, HeldOutDepths, HeldOutPoints
 
 _MOST_VIEWS = 24  # renders: those of most points
 

@@ -8,7 +8,7 @@ from pipelines.core.options import ExtraMarker, InputPath
 from pipelines.geodesy.vertical import Vertical
 from pipelines.splat.rasterizer.choice import Backend
 from pipelines.survey.options import CloudPath, FilledAreaOptions, MapOffset, UpAxis
-from pipelines.survey.report_parts import Alignment
+from pipelines.survey.reference_comparison import Alignment
 
 
 class EvaluateOptions(FilledAreaOptions):

@@ -42,7 +42,7 @@ from pipelines.surface.registration import fit_alignment
 from pipelines.surface.surface_views import ModelRenderer, SurfaceViews
 from pipelines.surface.visibility import Viewpoints, seen_surface
 from pipelines.survey.area import scene_points
-from pipelines.survey.report_parts import ReferenceComparison, ReferenceShift
+from pipelines.survey.reference_comparison import ReferenceComparison, ReferenceShift
 from pipelines.survey.solution import Solution
 
 _SQUARE_M = 32.0  # two million points of the reference at the most, in voxels of 0.025 m

@@ -18,7 +18,7 @@ from pipelines.geometry.footprints import first_of_voxels
 from pipelines.geometry.statistics import NORMAL_MAD
 from pipelines.surface.m3c2 import CONFIDENCE_95, Square, TiledPoints, at_random, m3c2, oriented_normals
 from pipelines.surface.visibility import SeenSurface
-from pipelines.survey.report_parts import CloudDistances, M3c2Figures, ReferenceGroup, SurfaceScore
+from pipelines.survey.reference_comparison import CloudDistances, M3c2Figures, ReferenceGroup, SurfaceScore
 
 CLASSES = ("other", "ground", "roof", "wall", "vegetation")
 SLOPES = ("0–15°", "15–45°", "45–75°", "75–90°")

@@ -57,7 +57,7 @@ from pipelines.surface.measured_cloud import CloudReader
 from pipelines.surface.surface_views import ModelRenderer, model_renderer
 from pipelines.survey.area import Area
 from pipelines.survey.headline import headline
-from pipelines.survey.held_out import HeldOutPoints
+from pipelines.survey.lidar_report import HeldOutDepths, HeldOutPoints
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
 from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CloudCrs, CrsOptions
@@ -74,7 +74,6 @@ from pipelines.survey.report import (
     SimilaritySigma,
     SurfaceHeight,
 )
-from pipelines.survey.report_parts import HeldOutDepths
 from pipelines.survey.solution import Solution, TrainedModel, read_sfm, read_solution
 from pipelines.survey.survey import Survey, SurveyedPoint
 from pipelines.survey.target_crs import TargetCrs, usable_crs
@@ -165,7 +164,7 @@ def _coordinates(survey: Survey, crs: PointCrs | None, center: FloatArray) -> Ma
 
 @dataclass(frozen=True)
 class Rendered:
-    """What the Gaussians of a trained model show: test views, check points on the surface, and any reference.
+    """Comparisons of the Gaussians of a trained model: test views, check points on the surface, and any reference.
 
     `held_out`: errors at measured points that the training was not given; None: there are none.
     """

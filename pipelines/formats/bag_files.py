@@ -44,7 +44,7 @@ class BagFiles:
 
 @dataclass
 class _Metadata:
-    """What counts of a `metadata.yaml`."""
+    """Fields of a `metadata.yaml` that count."""
 
     files: list[str] = field(default_factory=list)
     storage: str = ""

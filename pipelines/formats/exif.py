@@ -175,7 +175,7 @@ def read_tags(data: bytes) -> PhotoTags:
 
 @dataclass(frozen=True)
 class _Notes:
-    """What is said of the tags: why some are not used, and how some of a wrong form were read."""
+    """Remarks on the tags: why some are not used, and how some of a wrong form were read."""
 
     problems: list[str]
     corrections: list[str]

@@ -70,7 +70,7 @@ class OpfFrame:
 
 @dataclass(frozen=True)
 class OpfPhotograph:
-    """What was measured of a photograph: seconds since 1970, coordinates in the CRS, easting first, with σ."""
+    """Measurements of a photograph: seconds since 1970, coordinates in the CRS, easting first, with σ."""
 
     name: str
     time_s: float | None = None

@@ -1,4 +1,4 @@
-"""CRS, datum and units of a cloud, of what its file and the user say.
+"""CRS, datum and units of a cloud, by the statements of its file and of the user.
 
 1. `--lidar-crs` overrules the file's horizontal CRS and the unit of its eastings; its vertical part, or
    `--lidar-vertical`, overrules the file's datum. A remark names what was overruled.
@@ -44,7 +44,7 @@ class PlacedCrs:
 
 @dataclass(frozen=True)
 class _Statement:
-    """What one source says. `vertical` without a horizontal CRS, and the reverse, are possible."""
+    """Statement of one source. `vertical` without a horizontal CRS, and the reverse, are possible."""
 
     source: str
     horizontal: str = ""  # text of PROJ

@@ -42,7 +42,7 @@ _ELLIPSOIDAL_NAME = re.compile(r"ellipsoid", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class FileCrs:
-    """What a file's records say of its CRS, as they stand there.
+    """Statements of a file's records on its CRS, as they stand there.
 
     `wkt_counts`: the header has WKT decide where keys and WKT differ. `middle`: between the header's lowest and
     highest coordinates; None: not known.
@@ -67,7 +67,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class KeyedCrs:
-    """What keys say.
+    """Statement of keys.
 
     `epsg`: horizontal CRS. `vertical_epsg`: vertical CRS; `unit_is_open`: of a datum, whose keys name no unit.
     `problem`, `vertical_problem`: what stands in place of the CRS, and cannot be used.

@@ -1,4 +1,4 @@
-"""Vertical datums by name, whether they are stated or assumed, and the error for a missing grid.
+"""Vertical datums by name, stated or assumed; the error for a missing grid, and heights that no survey has.
 
 An ellipsoidal height and one above a geoid differ by up to 100 m, so every survey says which it has, and
 whether that was stated or assumed.

@@ -1,4 +1,4 @@
-"""What a flight left, whatever it was read from: photographs, their cameras, measured poses, navigation by time.
+"""Record of a flight, whatever it was read from: photographs, their cameras, measured poses, navigation by time.
 
 σ of positions is by option, by file, or by the kind of receiver. The navigation is as recorded, Earth-centred,
 until the survey's frame is known. Lever arm and boresight lead from the places and attitudes that the instruments
@@ -102,7 +102,7 @@ class RecordedNavigation:
 
 @dataclass(frozen=True)
 class FlightRecord:
-    """What was read of a flight; `navigation` is None where it was not recorded by time.
+    """Record of a flight; `navigation` is None where it was not recorded by time.
 
     `accompanying` are photographs of the other lenses of a rig, and `rotations` the stated ones of these lenses,
     lens ← reference as x, y, z, w, by photograph. `originals` has the hashes of the photographs in

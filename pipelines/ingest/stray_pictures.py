@@ -1,6 +1,7 @@
 """Pictures in a folder of photographs that are none of the survey: reduced copies, panoramas, blurred ones.
 
-Servers, viewers and other programs leave them beside the photographs, with the tags of these. Left out by name.
+Servers, viewers and other programs leave them beside the photographs, with the tags of these. They are left out,
+and a remark names them.
 """
 
 import math

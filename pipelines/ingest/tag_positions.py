@@ -57,7 +57,7 @@ class TaggedPositions:
 
 @dataclass(frozen=True)
 class _Flight:
-    """What the rules know of N photographs, and where they say what they chose."""
+    """Facts on N photographs by which the rules choose, and the remarks on their choices."""
 
     names: Sequence[str]
     order: Sequence[int]  # rows in the order in which they were taken
@@ -67,7 +67,7 @@ class _Flight:
 
 @dataclass(frozen=True)
 class _Choice:
-    """What was chosen of two sources: (N, k) values, σ of each (N,), and the σ that all share."""
+    """Choice between two sources: (N, k) values, σ of each (N,), and the σ that all share."""
 
     values: FloatArray
     sigma_m: FloatArray

@@ -1,4 +1,4 @@
-"""What written positions tell by their digits and zeros: steps that they are in, and heights that are none."""
+"""Steps of written positions, by their digits, and heights that are none, by their zeros."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Inspection of the machine: cores, memory, GPU, backends, grids of PROJ, Chromium, versions of the libraries."""
+"""The machine: cores, memory, GPU, backends and their kernels, grids of PROJ, Chromium, versions of libraries."""
 
 import platform
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ class BackendState:
 
 @dataclass(frozen=True)
 class Machine:
-    """What was found on this machine."""
+    """Parts and limits of this machine, as `inspect_machine` finds them."""
 
     system: str  # name, release, and the processor's architecture
     python: str

@@ -42,7 +42,7 @@ from pipelines.formats.georef_sidecar import (
 from pipelines.formats.geotiff import raster_frame
 from pipelines.report.page import Picture, number_text, png_file, preview, share
 from pipelines.survey.change_report import Change, ChangedRegion
-from pipelines.survey.report_parts import LidarReport
+from pipelines.survey.lidar_report import LidarReport
 from pipelines.survey.survey import Survey
 
 _REPORT = "report"

@@ -14,6 +14,7 @@ from pipelines.core.sentences import listed
 from pipelines.core.types import Vector3
 from pipelines.geometry.statistics import NORMAL_MAD
 from pipelines.report.page import decibel, number_text, share
+from pipelines.survey.measurement_errors import Group, VarianceFactor
 from pipelines.survey.report import (
     CheckPointErrors,
     CheckPoints,
@@ -22,7 +23,6 @@ from pipelines.survey.report import (
     PhotometricFigures,
     SurfaceHeight,
 )
-from pipelines.survey.report_parts import Group, VarianceFactor
 from pipelines.survey.survey import LOCAL_FRAME
 
 Level = Literal["good", "fair", "poor", "unknown"]

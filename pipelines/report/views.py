@@ -1,4 +1,4 @@
-"""What several sections show: solution, report of `evaluate`, observations; test views, curves of the training."""
+"""Facts of several sections: solution, report of `evaluate`, observations; test views, curves of the training."""
 
 import json
 from collections.abc import Mapping

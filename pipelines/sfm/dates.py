@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from pipelines.adjust.earlier_date import FEW_COMMON, NARROW_SPREAD, common_similarity
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.relative import Solved
 from pipelines.adjust.solution import posterior_of
-from pipelines.adjust.tied import FEW_COMMON, NARROW_SPREAD, common_similarity
 from pipelines.core.errors import DamagedPartialError, DegenerateGeometryError, InputError
 from pipelines.core.machine import chosen_threads
 from pipelines.core.plan import photograph_folder

@@ -41,7 +41,7 @@ _FAR_PX = 1e3  # residual of a point behind the camera
 
 @dataclass(frozen=True)
 class Side:
-    """What M matches are in one of two models: the photograph's camera, pixel, ray, and the point if it has one."""
+    """M matches in one of two models: the photograph's camera, pixel, ray, and the point if it has one."""
 
     cameras: dict[int, Camera]
     image: IntArray  # (M,) COLMAP's numbers

@@ -20,7 +20,7 @@ class Reconstructor(Protocol):
 
     @property
     def remedy(self) -> str:
-        """What to do after a crash."""
+        """Advice after a crash."""
 
     def estimate(
         self, photographs: int, photo_px: tuple[int, int], options: SfmOptions

@@ -1,6 +1,4 @@
-"""Simulated scene: a town of buildings, trees and cars as triangles, its painted ground, sun, and sites of
-targets.
-"""
+"""Simulated town: buildings, trees and cars as triangles, painted ground, sun, and sites of targets."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -61,8 +59,9 @@ class TargetSite:
 
 @dataclass(frozen=True)
 class Building:
-    """Rectangular building with one roof: centre (3,) in geo at ground level, axes (3, 3) in rows along, across,
-    up.
+    """Rectangular building with one roof.
+
+    Its centre (3,) in geo is at ground level, the rows of its axes (3, 3) are along, across, up.
     """
 
     center: FloatArray

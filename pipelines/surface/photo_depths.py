@@ -47,7 +47,7 @@ _LEAST_DIFFERENCE = 0.001  # of the scatters, relative to the depth
 
 @dataclass(frozen=True)
 class DepthStatement:
-    """What the user says of depth maps: metres of a value, direction, camera (fx, fy, cx, cy); None: unknown."""
+    """The user's statements on depth maps: metres of a value, direction, camera (fx, fy, cx, cy); None: unknown."""
 
     unit_m: float
     along: Along | None = None

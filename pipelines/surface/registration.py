@@ -23,7 +23,7 @@ from pipelines.geometry.similarity import Similarity, jacobian_at, perturbation
 from pipelines.geometry.statistics import cauchy_weight, mad_sigma
 from pipelines.surface.lidar_cloud import LidarCloud
 from pipelines.surface.visibility import DepthViews, Support, support
-from pipelines.survey.report_parts import Alignment, ReferenceShift
+from pipelines.survey.reference_comparison import Alignment, ReferenceShift
 
 UP = np.array([0.0, 0.0, 1.0])
 PLANTS = (3, 4, 5)

@@ -14,7 +14,9 @@ from pipelines.core.figures import Headline, ToleranceTest
 from pipelines.core.products import ImageName, Product, Remark, load_json
 from pipelines.core.types import Vector3
 from pipelines.geometry.statistics import ResidualStats
-from pipelines.survey.report_parts import HeldOutDepths, ReferenceComparison, VarianceFactor
+from pipelines.survey.lidar_report import HeldOutDepths
+from pipelines.survey.measurement_errors import VarianceFactor
+from pipelines.survey.reference_comparison import ReferenceComparison
 
 
 class _OptionalKeys(Product):

@@ -22,19 +22,19 @@ from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity, SimilarityRecord
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import ResidualStats
-from pipelines.survey.report import AccuracySummary
-from pipelines.survey.report_parts import (
+from pipelines.survey.measurement_errors import (
     EstimatedError,
     VarianceFactor,
     applied_factors,
     factor_of_check_points,
     with_variance_factors,
 )
+from pipelines.survey.report import AccuracySummary
 from pipelines.survey.survey import Survey
 
 
 class MeasurementVerdict(Product):
-    """What `init-sim3` has decided of the measurements, which every later stage keeps.
+    """Decisions of `init-sim3` on the measurements, which every later stage keeps.
 
     Attributes:
         gnss_outliers, control_outliers, distance_outliers: names of the images whose fixes, of the control points

@@ -1,4 +1,4 @@
-"""Measurements of a survey, product of `ingest`; estimates of its rig, product of `calibrate`.
+"""Measurements of a survey, product of `ingest`.
 
 All positions are in the frame `geo`: East-North-Up metres at the survey's origin. Without an origin, `geo` is a
 local metric frame, z up, with no place on Earth.
@@ -34,7 +34,6 @@ RIG_PARAMETERS: tuple[RigParameter, ...] = get_args(RigParameter)
 # base station next to nothing is left of it.
 DRIFT_SIGMA_M = {"RTK float": (0.2, 0.4), "single-frequency": (1.5, 3.0), "unknown receiver": (2.0, 4.0)}
 DRIFT_TIME_S = 300.0
-_COMPONENTS: dict[RigParameter, int] = {"time-offset": 1, "boresight": 3, "lever-arm": 3}
 
 
 def in_usual_order(names: Container[RigParameter]) -> tuple[RigParameter, ...]:
@@ -46,109 +45,6 @@ def in_usual_order(names: Container[RigParameter]) -> tuple[RigParameter, ...]:
 MountParameters = Annotated[
     tuple[MountParameter, ...], from_text(lambda text: listed_names(text, MOUNT_PARAMETERS)), WRITTEN
 ]
-
-
-class RigEstimate(Product):
-    """Parameter of the rig, estimated from the SfM cameras, by component.
-
-    Sign and unit are those of the option of `ingest` with the same name, whose value was the `start`.
-
-    Attributes:
-        value, sigma: of the time offset one number, else three.
-        observable: whether the flight shows the component.
-    """
-
-    name: RigParameter
-    unit: Literal["s", "deg", "m"]
-    value: tuple[float, ...]
-    sigma: tuple[float, ...]
-    start: tuple[float, ...]
-    observable: tuple[bool, ...]
-
-    @model_validator(mode="after")
-    def _has_all_components(self) -> RigEstimate:
-        lengths = {len(self.value), len(self.sigma), len(self.start), len(self.observable)}
-        if lengths != {_COMPONENTS[self.name]}:
-            raise ValueError(
-                f"{self.name} has {_COMPONENTS[self.name]} components: value, sigma, start, observable"
-            )
-        return self
-
-
-class FixLag(Product):
-    """Time by which the positions of photographs lag the exposure, from the motion of the SfM cameras.
-
-    Attributes:
-        lag_s: a position is that of so many seconds before the exposure; negative: after it.
-        applied: whether positions are moved to the exposure when the survey is read.
-        sigma_along_s: σ that positions get along the motion, times the velocity.
-        scatter_m: robust σ of the fixes about the SfM model along a horizontal axis, without and with the lag.
-        velocity_in_geo: of the photographs that took part, in m/s.
-    """
-
-    lag_s: float
-    sigma_s: float = Field(ge=0)
-    applied: bool
-    sigma_along_s: float = Field(ge=0)
-    scatter_m: tuple[float, float]
-    velocity_in_geo: dict[ImageName, Vector3]
-
-    @property
-    def sentence(self) -> str:
-        """What was found, and what was made of it."""
-        found = f"{abs(self.lag_s):.2f} ± {self.sigma_s:.2f} s"
-        if self.applied:
-            side = "before" if self.lag_s > 0 else "after"
-            return (
-                f"The positions are those of {found} {side} the exposures, by the motion of the SfM cameras: a "
-                f"{'lag' if self.lag_s > 0 else 'lead'} of the receiver, or of clocks. They are moved to the "
-                f"exposures, which leaves {self.scatter_m[1]:.2f} m of {self.scatter_m[0]:.2f} m along an axis."
-            )
-        if self.sigma_along_s:
-            return (
-                "The flight does not show whether the positions lag the exposures, as it has no lines in two "
-                f"directions or too few photographs, or scatters about the SfM model: a lag of "
-                f"± {self.sigma_along_s:.2f} s is part of their σ "
-                "along the motion."
-            )
-        return f"The positions are those of the exposures: lag {self.lag_s:+.2f} ± {self.sigma_s:.2f} s."
-
-
-class RigCalibration(Product):
-    """Product of `calibrate`: estimates of the rig, divided into those that `load_survey` applies and the others.
-
-    Attributes:
-        wanted: any of `time-offset`, `boresight`, `lever-arm`.
-        images, control_points: how many took part.
-        rms_position_m, rms_attitude_deg: robust σ of the residuals along an axis.
-        problem, remedy: why nothing could be estimated, and what to type against it, else empty.
-        fix_lag: of positions by photograph.
-    """
-
-    format_version: Literal[1] = 1
-    wanted: tuple[RigParameter, ...] = ()
-    applied: tuple[RigEstimate, ...] = ()
-    not_applied: tuple[RigEstimate, ...] = ()
-    images: int = 0
-    control_points: int = 0
-    rms_position_m: float | None = None
-    rms_attitude_deg: float | None = None
-    problem: str = ""
-    remedy: str = ""
-    fix_lag: FixLag | None = None
-
-    @model_validator(mode="after")
-    def _names_each_once(self) -> RigCalibration:
-        names = [estimate.name for estimate in (*self.applied, *self.not_applied)]
-        if len(set(names)) != len(names):
-            raise ValueError("a parameter is estimated twice")
-        return self
-
-    @property
-    def estimates(self) -> tuple[RigEstimate, ...]:
-        """All estimates, in the usual order of the parameters."""
-        by_name = {estimate.name: estimate for estimate in (*self.applied, *self.not_applied)}
-        return tuple(by_name[name] for name in in_usual_order(by_name))
 
 
 _NotNegative = Annotated[float, Field(ge=0)]
@@ -374,7 +270,7 @@ class KnownDistance(Product):
 class Survey(Product):
     """Product of `ingest`: all measurements of a survey, in one frame.
 
-    Positions and attitudes are as recorded, with the rig that was given to `ingest`. `calibrated.load_survey`
+    Positions and attitudes are as recorded, with the rig that was given to `ingest`. `navigation.load_survey`
     replaces that rig by the estimates of `calibrate`.
 
     Attributes:

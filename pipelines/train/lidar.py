@@ -33,8 +33,7 @@ from pipelines.surface.measured_cloud import MeasuredFiles
 from pipelines.surface.photo_depths import PhotoDepths
 from pipelines.surface.registration import Registration, registration
 from pipelines.surface.visibility import DepthViews, Viewpoints
-from pipelines.survey.held_out import HeldOutPoints
-from pipelines.survey.report_parts import LidarArea, LidarRegistration, LidarReport
+from pipelines.survey.lidar_report import HeldOutPoints, LidarArea, LidarRegistration, LidarReport
 from pipelines.survey.scene import Scene
 from pipelines.survey.survey import Survey
 from pipelines.train.lidar_surface import CloudVerdict, FusedSurface, surfels_of, verdict

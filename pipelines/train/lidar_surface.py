@@ -59,7 +59,7 @@ class ChangedArea:
 
 @dataclass(frozen=True)
 class CloudVerdict:
-    """What the photographs say of a cloud."""
+    """Verdict of the photographs on a cloud."""
 
     rejected: BoolArray  # (P,) inconsistent with the photographs
     confidence: FloatArray  # (P,) 0 … 1; 0 where the point is inconsistent with the photographs

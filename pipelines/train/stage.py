@@ -31,10 +31,10 @@ from pipelines.surface.lidar_cloud import ScannerTrack
 from pipelines.surface.measured_cloud import CloudReader, MeasuredFiles
 from pipelines.surface.photo_depths import DepthStatement, PhotoDepths, holds_depth_maps
 from pipelines.survey.area import boundary_area
+from pipelines.survey.lidar_report import LidarReport
 from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import ImageCache
-from pipelines.survey.report_parts import LidarReport
 from pipelines.survey.scene import Scene, load_adjusted_scene, photographs
 from pipelines.survey.solution import GeolocatedPoints, LensVignetting, Solution, TrainedModel
 from pipelines.train.compilation import compile_kernels

@@ -133,7 +133,7 @@ class Photographs:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a picture is to show.
+    """Content of a picture, as a page asks for it.
 
     Attributes:
         photograph: camera of the trained model whose photograph lies over the picture; None: none.

@@ -45,7 +45,7 @@ class ProposedMark:
 
 @dataclass(frozen=True)
 class ProposalSummary:
-    """What was proposed, and the file."""
+    """Proposed marks, and their file."""
 
     file: Path
     marks: int

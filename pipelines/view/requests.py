@@ -1,4 +1,4 @@
-"""What a page may ask: bodies of requests, checked before anything is done with them."""
+"""Bodies of the requests of a page, checked before anything is done with them."""
 
 import math
 from typing import Annotated, Self
@@ -21,7 +21,7 @@ Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class RequestBody(BaseModel):
-    """Body of a request."""
+    """Base of all bodies: no unknown fields, and finite numbers."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 

@@ -1,4 +1,4 @@
-"""What the user saves in the viewer: measurements as GeoJSON, GeoPackage, and a table for each kind.
+"""Files that the user saves in the viewer: measurements as GeoJSON, GeoPackage, and a table for each kind.
 
 Several viewers may show one workspace. Each change reads the file again, changes the records that it is about, and
 writes the file whole: nothing is lost of what another viewer has saved meanwhile. One writer at a time.

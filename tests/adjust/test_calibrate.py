@@ -25,8 +25,8 @@ from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw
 from pipelines.simulate.options import SimulateOptions
 from pipelines.simulate.stage import simulate
 from pipelines.simulate.truth import Truth
-from pipelines.survey.navigation import load_survey
-from pipelines.survey.survey import RigCalibration, Survey
+from pipelines.survey.navigation import RigCalibration, load_survey
+from pipelines.survey.survey import Survey
 from tests import bags
 from tests.earth import enu_from_lla
 from tests.refusals import numbers

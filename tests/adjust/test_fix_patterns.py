@@ -11,8 +11,8 @@ from scipy.interpolate import CubicSpline
 from pipelines.adjust.calibrate import lag_of, with_lag
 from pipelines.adjust.fix_patterns import level_axes, pattern_of
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.navigation import FIX_LAG, FIX_LAG_OPEN, at_exposures
-from pipelines.survey.survey import RigCalibration, Survey
+from pipelines.survey.navigation import FIX_LAG, FIX_LAG_OPEN, RigCalibration, at_exposures
+from pipelines.survey.survey import Survey
 from tests.refusals import codes, numbers, said
 from tests.scenes import Measured, Noise, TrueScene, looking_at, make_scene, sparse_model, survey_of
 

@@ -57,11 +57,11 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.ingest.bag_inspection import inspect_bag
 from pipelines.sfm.foreign_cameras import foreign_file
 from pipelines.surface.measured_cloud import CloudReader
-from pipelines.survey.navigation import NavigationTrack
+from pipelines.survey.navigation import NavigationTrack, RigCalibration, RigEstimate
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.report import EvaluationReport
 from pipelines.survey.solution import GeolocatedPoints, TrainedModel
-from pipelines.survey.survey import RigCalibration, RigEstimate, Survey
+from pipelines.survey.survey import Survey
 from pipelines.train.trainer import load_checkpoint
 from tests import bags, foreign_files, gopro
 from tests.formats.test_surveyors_tables import DEGREES, MRK, POS_HEAD, REFERENCE, SIGMAS, TAIL, XML

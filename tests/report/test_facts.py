@@ -31,8 +31,8 @@ from pipelines.report.points import cut_chips, points_facts
 from pipelines.report.verdicts import FIX_OUTLIERS, REGISTERED, Measured, verdict_of, verdicts
 from pipelines.report.views import read_metrics
 from pipelines.survey.area import ground_sampling_m, photographs_that_see
+from pipelines.survey.measurement_errors import VarianceFactor
 from pipelines.survey.report import ByAxis, DistanceError, PointError, PredictedSigma, SurfaceHeight
-from pipelines.survey.report_parts import VarianceFactor
 from pipelines.survey.solution import fix_differences
 from pipelines.survey.survey import LOCAL_FRAME, Survey
 from tests.dense_bundle import correction_basis, lens_elimination

@@ -14,7 +14,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.report.page import Page, Section, render_page
 from pipelines.report.plots.maps import DrawnArea, write_lidar_map
 from pipelines.report.record import lidar_facts
-from pipelines.survey.report_parts import DepthErrors, HeldOutDepths, LidarArea, LidarRegistration, LidarReport
+from pipelines.survey.lidar_report import DepthErrors, HeldOutDepths, LidarArea, LidarRegistration, LidarReport
 
 
 def area(kind: str, area_m2: float) -> LidarArea:

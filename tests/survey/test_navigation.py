@@ -14,8 +14,15 @@ from pipelines.core.products import load_json, save_json, save_npz
 from pipelines.core.stages import RIG, SURVEY, TRACK
 from pipelines.core.workspace import Workspace
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
-from pipelines.survey.navigation import NavigationTrack, apply_calibration, load_survey, shown_by
-from pipelines.survey.survey import Attitude, RigCalibration, RigEstimate, RigParameter, Survey, SurveyImage
+from pipelines.survey.navigation import (
+    NavigationTrack,
+    RigCalibration,
+    RigEstimate,
+    apply_calibration,
+    load_survey,
+    shown_by,
+)
+from pipelines.survey.survey import Attitude, RigParameter, Survey, SurveyImage
 from tests.refusals import refused
 from tests.scenes import Measured, Noise, make_scene, survey_of
 

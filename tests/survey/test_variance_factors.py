@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.survey.report_parts import VarianceFactor, factor_of_check_points, with_variance_factors
+from pipelines.survey.measurement_errors import VarianceFactor, factor_of_check_points, with_variance_factors
 from pipelines.survey.survey import Survey
 from tests.scenes import Measured, Noise, make_scene, survey_of
 

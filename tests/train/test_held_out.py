@@ -15,7 +15,7 @@ from pipelines.evaluate.held_out import held_out_depths
 from pipelines.geometry.cameras import CameraPoses, Pinhole, ViewPose
 from pipelines.geometry.similarity import Similarity
 from pipelines.surface.lidar_cloud import in_held_out_squares
-from pipelines.survey.held_out import HeldOutPoints
+from pipelines.survey.lidar_report import HeldOutPoints
 from pipelines.train.lidar import held_out_points
 from tests.towns import EXTRA, FOCAL_PX, SIGMA_M, SIZE, TOWN, WITH_EXTRA, Town, scanned, views_of
 

@@ -15,8 +15,8 @@ from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.splat.rasterizer import cuda, cuda_kernels
 from pipelines.survey.block_plan import BlockPlan, BlockTraining
+from pipelines.survey.lidar_report import LidarReport
 from pipelines.survey.report import EvaluationReport
-from pipelines.survey.report_parts import LidarReport
 from pipelines.survey.solution import TrainedModel
 from pipelines.train import trainer
 from tests.block_scenes import georef, make_field, write_field

@@ -51,7 +51,7 @@ def label(axes: Axes, title: str, *, x: str | None = None, y: str | None = None)
 
 
 def add_scale(figure: Figure, image: ScalarMappable, text: str, **place: Any) -> Colorbar:
-    """Add a colour bar with what it measures; `place` is where matplotlib puts it."""
+    """Add a colour bar with its quantity; `place` are the arguments of matplotlib that put it."""
     bar = figure.colorbar(image, **place)
     bar.set_label(text, fontsize=LABEL_POINTS)
     bar.ax.tick_params(labelsize=TICK_POINTS)

@@ -1,1 +1,1 @@
-"""What holds a training to the Earth: its unknowns as tensors, and the losses on them."""
+"""Georeference of a training: its unknowns as tensors, and the losses on them."""

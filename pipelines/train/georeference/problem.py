@@ -1,4 +1,4 @@
-"""What a training's georeference costs: the adjustment's own χ², or the losses of the paper; and its optimiser.
+"""Cost of a training's georeference: the adjustment's own χ², or the losses of the paper; and its optimiser.
 
 `joint`: the measurements and the photographs' observations have made a solution, and a normal matrix N. A motion
 from it costs (ξ − ξ̂)ᵀ N (ξ − ξ̂): every fix, control point, mark and attitude is in N. A training therefore starts
