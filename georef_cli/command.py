@@ -85,7 +85,7 @@ class Command(click.Command):
         title: str = "",
         params: Sequence[click.Parameter] = (),
         sections: Mapping[str, Sequence[str]] = MappingProxyType({}),
-        **more: Any,
+        **more: Any,  # of `click.Command`
     ) -> None:
         self.own_params, self.sections = tuple(params), sections
         text = f"{title or COMMANDS[name].help}\n\n{inspect.cleandoc(help)}"

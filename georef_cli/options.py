@@ -131,7 +131,7 @@ def given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
     }
 
 
-def _click_type(kind: Any) -> click.ParamType[Any]:
+def _click_type(kind: type) -> click.ParamType[Any]:
     if get_origin(kind) is Literal:
         return click.Choice(get_args(kind))
     if kind is Path:

@@ -19,6 +19,7 @@ from pipelines.core.products import Remark, dump_json, union
 from pipelines.core.runner import Outcome
 from pipelines.core.stages import ADJUSTMENT, MODEL, REPORT
 from pipelines.core.staleness import cautions_by_stage, document_of_cautions
+from pipelines.core.types import JsonValue
 from pipelines.core.workspace import Workspace
 from pipelines.survey.headline import headline_of
 
@@ -130,12 +131,12 @@ def _place_table(result: Overview, *, brief: bool = False) -> Table:
 PIPED_WIDTH = 120
 
 
-def print_json(document: Any) -> None:
+def print_json(document: JsonValue) -> None:
     """Write a document to stdout as JSON."""
     click.echo(dump_json(document))
 
 
-def print_result(document: Any, *parts: RenderableType, as_json: bool) -> None:
+def print_result(document: JsonValue, *parts: RenderableType, as_json: bool) -> None:
     """Print the result of a command in one of its two forms."""
     if as_json:
         print_json(document)

@@ -7,7 +7,7 @@ import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from pipelines.core import runner
 from pipelines.core.errors import InputError, storage_failures
 from pipelines.core.files import remove, replace_file, replace_folder
 from pipelines.core.manifest import MANIFEST
-from pipelines.core.options import remembered
+from pipelines.core.options import OptionValue, remembered
 from pipelines.core.stages import BY_NAME, StageSpec
 from pipelines.core.staleness import Flags, must_exist
 from pipelines.core.validators import require_text
@@ -51,7 +51,7 @@ class StageCommand(Command):
         *,
         before: click.Argument | None = None,
         announced: bool = False,
-        more: Callable[[Workspace, Mapping[str, Any]], Sequence[RenderableType]] = lambda *_: (),
+        more: Callable[[Workspace, Flags], Sequence[RenderableType]] = lambda *_: (),
     ) -> None:
         self.spec, self._more, self._announced = BY_NAME[name], more, announced
         is_folder = self.spec.delivers == "folder"
@@ -106,14 +106,14 @@ class StageCommand(Command):
             )
         return 0
 
-    def _flags(self, ctx: click.Context, values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    def _flags(self, ctx: click.Context, values: Flags) -> dict[str, dict[str, Any]]:
         """Return the options of this and earlier commands, by stage."""
         name = self.spec.name
         given = options.given(ctx, self.spec.options.model_fields)
         forget = options.forgotten(self.spec.options, values["forget"])
         return remembered(values["workspace"].root, [name], {name: given}, {name: forget})
 
-    def act(self, ctx: click.Context, **values: Any) -> None:
+    def act(self, ctx: click.Context, **values: OptionValue) -> None:
         """Run the stage, copy its result to the user's path, and print it.
 
         Raises:

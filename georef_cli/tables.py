@@ -23,6 +23,7 @@ from pipelines.core.runner import Outcome
 from pipelines.core.sentences import duration, printable, printable_lines
 from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.staleness import StageState
+from pipelines.core.types import Json, JsonValue
 from pipelines.core.workspace import Workspace
 from pipelines.survey.headline import PointLine, point_lines
 from pipelines.survey.lidar_report import HeldOutDepths
@@ -198,7 +199,7 @@ def cautions(by_stage: Mapping[str, Sequence[Remark]]) -> list[Renderable]:
     ]
 
 
-def _cameras(rows: Sequence[Mapping[str, Any]]) -> list[Renderable]:
+def _cameras(rows: Sequence[Json]) -> list[Renderable]:
     """Return the table of a survey's cameras, without columns that are empty for all."""
     if not rows:
         return []
@@ -222,7 +223,7 @@ def _cameras(rows: Sequence[Mapping[str, Any]]) -> list[Renderable]:
     return ["", table]
 
 
-def date_volumes(dates: Sequence[Mapping[str, Any]]) -> list[Renderable]:
+def date_volumes(dates: Sequence[Json]) -> list[Renderable]:
     """Return the table of the volumes of `georef change` at each date of a chain; none: there is no chain."""
     if not dates:
         return []
@@ -312,7 +313,7 @@ def comparison(table: Comparison) -> list[Renderable]:
     ]
 
 
-def topics(rows: Iterable[Mapping[str, Any]]) -> ByWidth:
+def topics(rows: Iterable[Json]) -> ByWidth:
     """Return the table of `georef inspect`, a line for each topic; a narrow terminal has no room for types."""
     table = plain_table(
         "topic", "type", "messages", "Hz", "span", "longest gap", "frame", "use", "", right=range(2, 6)
@@ -401,7 +402,7 @@ def _held_out(depths: HeldOutDepths | None) -> Group | None:
     return _rows(title, rows, columns)
 
 
-def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Group | None:
+def _rows(title: str, rows: Mapping[str, Mapping[str, JsonValue]], columns: Mapping[str, str]) -> Group | None:
     """Return a table under its title, with the rows and columns that have a figure; None without any."""
     known = {name: row for name, row in rows.items() if any(row.get(key) for key in columns)}
     heads = {key: head for key, head in columns.items() if any(row.get(key) is not None for row in known.values())}
@@ -411,7 +412,7 @@ def _rows(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[st
     return Group(f"\n[bold]{title}[/]", figures(tuple(heads.values()), cells))
 
 
-def _accuracy(ways: Mapping[Any, CheckPointErrors]) -> Group | None:
+def _accuracy(ways: Mapping[str, CheckPointErrors]) -> Group | None:
     """Return the accuracy by the check points after the standard, beside the prediction."""
     rows = {}
     for way, errors in ways.items():
@@ -431,7 +432,7 @@ def _accuracy(ways: Mapping[Any, CheckPointErrors]) -> Group | None:
     return _rows("Accuracy with the check points' own survey (ASPRS), and their predicted σ, metres", rows, columns)
 
 
-def _number(value: Any) -> str:
+def _number(value: JsonValue) -> str:
     if value is None:
         return MISSING
     if isinstance(value, float):

@@ -10,10 +10,12 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, TextIO
+from types import TracebackType
+from typing import TextIO
 
 from pipelines.core.child import ORPHAN_S, MessageSender
 from pipelines.core.sentences import printable, printable_lines
+from pipelines.core.types import JsonValue
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,9 @@ class SafeFormatter(logging.Formatter):
     def formatMessage(self, record: logging.LogRecord) -> str:
         return printable(super().formatMessage(record))
 
-    def formatException(self, ei: Any) -> str:
+    def formatException(
+        self, ei: tuple[type[BaseException], BaseException, TracebackType | None] | tuple[None, None, None]
+    ) -> str:
         return printable_lines(super().formatException(ei))
 
 
@@ -62,7 +66,7 @@ class StderrSender(MessageSender):
             with suppress(OSError, ValueError):  # a stream without a descriptor
                 threading.Thread(target=_end_without_reader, args=(stream.fileno(),), daemon=True).start()
 
-    def send(self, kind: str, **content: Any) -> None:
+    def send(self, kind: str, **content: JsonValue) -> None:
         if not self._has_reader:
             return
         try:

@@ -18,12 +18,13 @@ from georef_cli.output import print_json, print_result, print_rich
 from georef_cli.tables import WIDE, ByWidth, Renderable, literal, plain_table
 from pipelines.core.errors import GeorefError
 from pipelines.core.figures import ACCURACY_H, ACCURACY_V, CHECK_POINTS, MISSING
-from pipelines.core.options import input_paths, remembered
+from pipelines.core.options import OptionValue, input_paths, remembered
 from pipelines.core.plan import plan
 from pipelines.core.progress import Progress
 from pipelines.core.sentences import about, duration
 from pipelines.core.stages import BY_NAME
 from pipelines.core.staleness import stage_config
+from pipelines.core.types import Json
 from pipelines.jobs.batch import BatchTable, PlannedMission
 from pipelines.jobs.missions import Mission, load_missions
 
@@ -32,7 +33,7 @@ log = logging.getLogger(__name__)
 FAILED = 1
 
 
-def _batch(ctx: click.Context, **values: Any) -> int:
+def _batch(ctx: click.Context, **values: OptionValue) -> int:
     from pipelines.jobs.batch import page_file, run_batch
 
     flags = settings(values["settings"], BY_NAME.values())
@@ -129,7 +130,7 @@ def dry_rows(missions: Iterable[tuple[PlannedMission, RunEstimate | None]]) -> l
     ]
 
 
-def dry_tables(rows: Sequence[dict[str, Any]], together: int) -> list[Renderable]:
+def dry_tables(rows: Sequence[Json], together: int) -> list[Renderable]:
     """Return the table of the rows of a dry run, in which some missions run together."""
     table = plain_table("mission", "photographs", "about", "memory", "stages to run", right=[1, 2, 3])
     for row in rows:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -16,6 +16,8 @@ from georef_cli.options import FOLDER, flag
 from georef_cli.output import print_json, print_result
 from georef_cli.tables import literal
 from pipelines.core.machine import free_main_memory_bytes, thread_count
+from pipelines.core.options import OptionValue
+from pipelines.core.staleness import Flags
 from pipelines.jobs.engine import Engine
 from pipelines.jobs.local import LocalEngine, chosen_engine
 
@@ -56,7 +58,7 @@ ENGINE = (
 )
 
 
-def engine_for(values: Mapping[str, Any], at_a_time: int | None = None) -> Engine:
+def engine_for(values: Flags, at_a_time: int | None = None) -> Engine:
     """Return the engine that the options choose, for at most so many jobs at a time."""
     if values["cluster"] is None:
         for option in ("certificates", "insecure", "storage"):
@@ -72,14 +74,14 @@ def engine_for(values: Mapping[str, Any], at_a_time: int | None = None) -> Engin
 
 
 @contextmanager
-def requested_engine(values: Mapping[str, Any]) -> Iterator[None]:
+def requested_engine(values: Flags) -> Iterator[None]:
     """Let stages share their work with the engine that `--cluster` chooses; without it, with that in use."""
     engine = engine_for(values)
     with nullcontext() if values["cluster"] is None else chosen_engine(engine):
         yield
 
 
-def cluster_address(text: str, values: Mapping[str, Any], option: str, *, is_node: bool = False) -> ClusterAddress:
+def cluster_address(text: str, values: Flags, option: str, *, is_node: bool = False) -> ClusterAddress:
     """Return the address that an option or argument gives, with the certificate that the other options choose.
 
     A program that is a node of the cluster, on this machine, makes a missing certificate.
@@ -121,7 +123,7 @@ def _certificates(folder: Path, as_json: bool) -> None:
     print_result(document, f"{literal(str(folder))} {text}", as_json=as_json)
 
 
-def _scheduler(listen: str | None, as_json: bool, **values: Any) -> None:
+def _scheduler(listen: str | None, as_json: bool, **values: OptionValue) -> None:
     from pipelines.jobs.dask_task import run_scheduler
 
     everywhere = "127.0.0.1" if values["certificates"] is None else "0.0.0.0"
@@ -139,7 +141,7 @@ def _worker(
     gpus: int | None,
     name: str | None,
     as_json: bool,
-    **values: Any,
+    **values: OptionValue,
 ) -> None:
     from pipelines.jobs.dask_task import run_worker
 

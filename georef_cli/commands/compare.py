@@ -1,7 +1,5 @@
 """Command `georef compare`."""
 
-from typing import Any
-
 import click
 
 from georef_cli import boundary, options, tables
@@ -9,10 +7,11 @@ from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.output import document_of, print_result
 from pipelines.compare.configurations import BY_CONFIGURATION, COMMON_TRAIN_OPTIONS, select_configurations
+from pipelines.core.options import OptionValue
 from pipelines.train.options import TrainOptions
 
 
-def _compare(ctx: click.Context, **values: Any) -> None:
+def _compare(ctx: click.Context, **values: OptionValue) -> None:
     from pipelines.compare.stage import compare
 
     configurations = select_configurations(values["configs"])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import click
 
 from georef_cli import options
@@ -17,7 +15,7 @@ class TopicType(click.ParamType[str]):
 
     name = "topic"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
         if value not in _names(ctx):
             self.fail(f"{value!r} is no topic and no command. The topics are {', '.join(TOPICS)}.", param, ctx)
         return str(value)

@@ -1,18 +1,17 @@
 """Command `georef info`."""
 
-from typing import Any
-
 import click
 
 from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.output import overview_text, print_result
+from pipelines.core.options import OptionValue
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.survey.options import CrsOptions
 
 
-def _info(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: Any) -> None:
+def _info(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: OptionValue) -> None:
     from pipelines.deliver.overview import overview
 
     must_exist(workspace)

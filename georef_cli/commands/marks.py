@@ -1,7 +1,6 @@
 """Command `georef marks`."""
 
 import dataclasses
-from typing import Any
 
 import click
 
@@ -10,12 +9,13 @@ from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.output import print_result
 from georef_cli.tables import literal
+from pipelines.core.options import OptionValue
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.view.options import ProposalOptions
 
 
-def _marks(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: Any) -> None:
+def _marks(ctx: click.Context, workspace: Workspace, as_json: bool, **_values: OptionValue) -> None:
     from pipelines.view.proposed_marks import propose_marks
 
     must_exist(workspace)

@@ -17,7 +17,7 @@ from georef_cli.options import SET, settings
 from georef_cli.output import evaluated_cameras, print_outcomes
 from pipelines.core import runner
 from pipelines.core.errors import GeorefError
-from pipelines.core.options import names_of_flags, remembered
+from pipelines.core.options import OptionValue, names_of_flags, remembered
 from pipelines.core.progress import SILENT, ProgressTask
 from pipelines.core.sentences import about
 from pipelines.core.stages import BY_NAME, DELIVERABLES, MODEL, PIPELINE, StageSpec, named_deliverables, stage_slice
@@ -73,7 +73,7 @@ DELIVER = click.Option(
 )
 
 
-def _run(ctx: click.Context, **values: Any) -> None:
+def _run(ctx: click.Context, **values: OptionValue) -> None:
     try:
         stages = stage_slice(values["first"], values["last"])
     except GeorefError as error:
@@ -187,7 +187,7 @@ def _later(stages: tuple[StageSpec, ...]) -> tuple[StageSpec, ...]:
 
 
 def _flags(
-    ctx: click.Context, stages: tuple[StageSpec, ...], flags: dict[str, dict[str, Any]]
+    ctx: click.Context, stages: tuple[StageSpec, ...], flags: dict[str, dict[str, OptionValue]]
 ) -> dict[str, dict[str, Any]]:
     """Return the given options by stage, those of `--set` among them."""
     running, last = {spec.name for spec in stages}, PIPELINE.index(stages[-1]) if stages[-1] in PIPELINE else None

@@ -3,7 +3,6 @@
 import dataclasses
 import time
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -12,12 +11,12 @@ from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.output import print_result
 from georef_cli.tables import literal
-from pipelines.core.options import CONFIG_FILE
+from pipelines.core.options import CONFIG_FILE, OptionValue
 from pipelines.core.sentences import duration
 from pipelines.simulate.options import SimulateOptions
 
 
-def _simulate(ctx: click.Context, **values: Any) -> None:
+def _simulate(ctx: click.Context, **values: OptionValue) -> None:
     from pipelines.simulate.stage import simulate
 
     survey_options = options.resolved(ctx, SimulateOptions, Path(CONFIG_FILE))

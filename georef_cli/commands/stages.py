@@ -17,7 +17,7 @@ from georef_cli.output import print_json, print_outcome, print_rich
 from georef_cli.stage import StageCommand
 from georef_cli.tables import Renderable, coordinate_tables, error_tables, literal, plain_table
 from pipelines.core import stages
-from pipelines.core.options import StageOptions, remember
+from pipelines.core.options import OptionValue, StageOptions, remember
 from pipelines.core.products import load_json
 from pipelines.core.sentences import about
 from pipelines.core.staleness import Flags, must_exist, stage_config
@@ -60,7 +60,7 @@ _CHUNK = click.Option(
 class _SfmCommand(StageCommand):
     """Command of `sfm`, whose jobs call it with `--chunk`."""
 
-    def act(self, ctx: click.Context, **values: Any) -> None:
+    def act(self, ctx: click.Context, **values: OptionValue) -> None:
         name = values.pop("chunk")
         if name is None:
             with requested_engine(values):
@@ -76,7 +76,7 @@ class _SfmCommand(StageCommand):
 _COMPONENTS = {"boresight": ("x", "y", "z"), "lever-arm": ("forward", "right", "down"), "time-offset": ("",)}
 
 
-def _calibrated(workspace: Workspace, values: Mapping[str, Any]) -> tuple[RenderableType, ...]:
+def _calibrated(workspace: Workspace, values: Flags) -> tuple[RenderableType, ...]:
     if values["as_json"]:
         return ()
     from pipelines.survey.navigation import RigCalibration
@@ -124,7 +124,7 @@ _RESUME = flag("--resume", text="Continue the interrupted run; refuse other opti
 class _TrainCommand(StageCommand):
     """Command of `train`, whose jobs in a training in blocks call it with `--part`."""
 
-    def act(self, ctx: click.Context, **values: Any) -> None:
+    def act(self, ctx: click.Context, **values: OptionValue) -> None:
         part = values.pop("part")
         with requested_engine(values):
             if part is None:
@@ -147,7 +147,7 @@ class _TrainCommand(StageCommand):
         resolved: Any = stage_config(workspace, self.spec, flags)
         return Parts(workspace, resolved)
 
-    def _plan(self, ctx: click.Context, values: dict[str, Any]) -> None:
+    def _plan(self, ctx: click.Context, values: dict[str, OptionValue]) -> None:
         """Divide the survey into blocks, remember the options, and show the plan."""
         from pipelines.train.estimate import block_processor_s
 
@@ -168,7 +168,7 @@ class _TrainCommand(StageCommand):
         processor_s = None if parts.on_gpu() else block_processor_s(plan, photo_px, parts.options)
         print_rich(*block_table(plan, parts.states(plan), processor_s))
 
-    def _run_part(self, ctx: click.Context, part: str, values: dict[str, Any]) -> None:
+    def _run_part(self, ctx: click.Context, part: str, values: dict[str, OptionValue]) -> None:
         """Run a part as a job does: without the workspace's lock, which the process that started it may hold."""
         if options.given(ctx, self.spec.options.model_fields):
             raise click.UsageError(
@@ -219,7 +219,7 @@ def block_table(
 _POINTS = flag("--points", text="Print the errors of every check and control point.")
 
 
-def _evaluated(workspace: Workspace, values: Mapping[str, Any]) -> list[Group]:
+def _evaluated(workspace: Workspace, values: Flags) -> list[Group]:
     """Return coordinates, and errors point by point if they are wanted."""
     report = read_report(workspace.path(stages.REPORT))
     return [*coordinate_tables(report), *(error_tables(report) if values["points"] else [])]

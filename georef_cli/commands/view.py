@@ -3,7 +3,6 @@
 import contextlib
 import threading
 import webbrowser
-from typing import Any
 
 import click
 
@@ -11,12 +10,13 @@ from georef_cli import options
 from georef_cli.command import Command
 from georef_cli.display import progress_for
 from georef_cli.output import print_result
+from pipelines.core.options import OptionValue
 from pipelines.core.staleness import must_exist
 from pipelines.core.workspace import Workspace
 from pipelines.view.options import ViewOptions
 
 
-def _view(ctx: click.Context, workspace: Workspace, open_page: bool, as_json: bool, **_values: Any) -> None:
+def _view(ctx: click.Context, workspace: Workspace, open_page: bool, as_json: bool, **_values: OptionValue) -> None:
     from pipelines.core.extras import require
 
     require("viewer")

@@ -9,14 +9,13 @@ height step is the place of a wall within its neighbourhood, common to the cells
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label, uniform_filter
 
 from pipelines.core.errors import DegenerateGeometryError
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.geometry.statistics import huber_weight, mad_sigma
 
 QUANTILE_95 = 1.96
@@ -302,7 +301,7 @@ class Volume:
         return float(cell_m2 * np.sqrt(self.datum**2 + factor * self.variance * joined + self.steps))
 
 
-def region_volumes(number: NDArray[Any], cells: Cells, count: int) -> list[Volume]:
+def region_volumes(number: IntArray | NDArray[np.int32], cells: Cells, count: int) -> list[Volume]:
     """Return the sums of regions 1 … `count`, by the number (H, W) of each cell; 0: no region.
 
     A wall lies in the neighbourhood of the cells on both of its sides: its error in a volume is half their sum, and

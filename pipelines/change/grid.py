@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
@@ -26,6 +26,9 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import CrsSidecar, sidecar_path
 from pipelines.formats.geotiff import RasterFrame, cells_inside, is_same_crs, raster_frame, read_onto
 from pipelines.geodesy.crs import PointCrs, parse_crs
+
+if TYPE_CHECKING:
+    import shapely
 
 WINDOW_PX = 1024
 MEASURED = 255  # in measured.tif
@@ -107,7 +110,7 @@ class CommonGrid:
         rasters: tuple[EpochRasters, EpochRasters],
         epochs: tuple[Epoch, Epoch],
         shared: Shared,
-        inside: Any = None,
+        inside: shapely.Geometry | None = None,
         tied: Tied | None = None,
     ) -> None:
         self.rasters, self.epochs, self._shared, self._inside = rasters, epochs, shared, inside
@@ -231,7 +234,7 @@ class CommonGrid:
         south, east = np.gradient(height_m, self.frame.step_y * self.unit_m, self.frame.step_x * self.unit_m)
         return np.stack([east, -south], axis=-1)
 
-    def samples(self, stable: Any, progress: Progress) -> Samples:
+    def samples(self, stable: shapely.Geometry | None, progress: Progress) -> Samples:
         """Return samples of cells, and of pairs of them; only in a polygon of stable ground, if there is one."""
         rng = np.random.default_rng(_SEED)
         windows = list(self.windows())

@@ -226,10 +226,10 @@ def common_on_map(compared: Compared, frame: RasterFrame) -> tuple[tuple[float, 
     return tuple(zip(x[inside].tolist(), y[inside].tolist(), used[inside].tolist(), strict=True))
 
 
-def _outline(name: str, polygon: Any, frame: RasterFrame) -> Outline:
+def _outline(name: str, polygon: shapely.Geometry, frame: RasterFrame) -> Outline:
     """Return the outline of a polygon of the CRS in pixels of a picture over a frame."""
 
-    def moved(plan: NDArray[Any]) -> NDArray[Any]:
+    def moved(plan: FloatArray) -> NDArray[Any]:
         return np.column_stack(
             [(plan[:, 0] - frame.west) / frame.step_x, (frame.north - plan[:, 1]) / frame.step_y]
         )
@@ -276,7 +276,7 @@ def profile_facts(compared: Compared) -> tuple[ProfileFacts, ...]:
     return tuple(found)
 
 
-def profile_through(compared: Compared, polygon: Any) -> ChangeProfile:
+def profile_through(compared: Compared, polygon: shapely.Geometry) -> ChangeProfile:
     """Return the heights of both epochs, the later one after registration, along the longer axis of a polygon."""
     grid = compared.grid
     line = _line_through(polygon, grid.unit_m)
@@ -295,7 +295,7 @@ def profile_through(compared: Compared, polygon: Any) -> ChangeProfile:
     return ChangeProfile(distance, np.stack([heights[0], later]), np.stack(sigmas), inside_parts(distance, inside))
 
 
-def _line_through(polygon: Any, unit_m: float) -> FloatArray:
+def _line_through(polygon: shapely.Geometry, unit_m: float) -> FloatArray:
     """Return points (N, 2) on the longer axis of a polygon, through its middle and beyond both ends."""
     box = shapely.minimum_rotated_rectangle(shapely.force_2d(polygon))
     corner = np.array(getattr(box, "exterior", box).coords)

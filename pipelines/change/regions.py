@@ -21,7 +21,7 @@ from scipy.special import erfc
 
 from pipelines.change.detection import QUANTILE_95, Cells, Noise, Volume, region_volumes
 from pipelines.change.grid import CommonGrid, GridWindow
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import AnyArray, BoolArray, FloatArray, IntArray
 from pipelines.formats.geotiff import cells_inside, outlines, read_cells, write_part
 from pipelines.survey.change_report import ChangedRegion, DoubtfulRegion
 
@@ -40,7 +40,7 @@ class RasterParts:
     def path(self, name: str, window: GridWindow) -> Path:
         return self.folder / f"{name}_{window.row}_{window.column}.tif"
 
-    def write(self, name: str, window: GridWindow, values: NDArray[Any]) -> None:
+    def write(self, name: str, window: GridWindow, values: AnyArray) -> None:
         write_part(self.path(name, window), values[None], self.grid.part(window))
 
     def cells(self, window: GridWindow) -> Cells:
@@ -118,7 +118,11 @@ def is_real(net_m3: FloatArray, sigma_m3: FloatArray, places: float) -> BoolArra
 
 
 def find_regions(
-    parts: RasterParts, sign: NDArray[np.int8], noise: Noise, given: tuple[Any, ...], min_area_m2: float
+    parts: RasterParts,
+    sign: NDArray[np.int8],
+    noise: Noise,
+    given: tuple[shapely.Geometry, ...],
+    min_area_m2: float,
 ) -> FoundRegions:
     """Return the regions of the given polygons, then those found in significant cells of `sign` (H, W)."""
     grid = parts.grid
@@ -202,7 +206,7 @@ def without_doubtful(
 
 def _named(
     every: tuple[Volume, ...],
-    polygons: list[Any],
+    polygons: list[shapely.Geometry],
     *,
     given: int,
     sign: IntArray | NDArray[np.int8],

@@ -50,7 +50,7 @@ from pipelines.core.products import Remark, save_json, union
 from pipelines.core.sentences import listed
 from pipelines.core.stages import CHANGE_PAGE
 from pipelines.core.staleness import status
-from pipelines.core.types import BoolArray, vector3
+from pipelines.core.types import BoolArray, FloatArray, vector3
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.formats.geotiff import Band, RasterKind, sampled_raster, write_mosaic
 from pipelines.formats.tables import table_text
@@ -263,7 +263,7 @@ def _polygons(path: Path | None, field: str, after: EpochRasters, options: Chang
     )
 
     def moved(one: Outlines) -> list[Any]:
-        def to_rasters(plan: NDArray[Any]) -> NDArray[Any]:
+        def to_rasters(plan: FloatArray) -> NDArray[Any]:
             return crs.xyz_from_lla(one.lla(plan, path))[:, :2]
 
         return [shapely.transform(part, to_rasters) for part in one.polygons]
@@ -394,7 +394,11 @@ def _write_common(folder: Path, tied: Tied) -> None:
 
 
 def _write_vectors(
-    folder: Path, change: Change, polygons: list[Any], doubtful: list[Any], grid: CommonGrid
+    folder: Path,
+    change: Change,
+    polygons: list[shapely.Geometry],
+    doubtful: list[shapely.Geometry],
+    grid: CommonGrid,
 ) -> None:
     """Write the regions and the doubtful ones with their polygons, and the table of volumes by date."""
     _write_geojson(folder / "regions.geojson", change.regions, polygons, grid)
@@ -409,10 +413,12 @@ def _write_vectors(
     replace_text(folder / "regions.csv", table_text([heads, *([row[name] for name in heads] for row in rows)]))
 
 
-def _write_geojson(path: Path, regions: Sequence[ChangedRegion], polygons: list[Any], grid: CommonGrid) -> None:
+def _write_geojson(
+    path: Path, regions: Sequence[ChangedRegion], polygons: list[shapely.Geometry], grid: CommonGrid
+) -> None:
     """Write regions with their polygons, which are in the CRS of the grid, in WGS84."""
 
-    def in_wgs84(plan: NDArray[Any]) -> NDArray[Any]:
+    def in_wgs84(plan: FloatArray) -> NDArray[Any]:
         lla = grid.crs.lla_from_xyz(np.column_stack([plan, np.zeros(len(plan))]))
         return np.round(lla[:, [1, 0]], 8)
 

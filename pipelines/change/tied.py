@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
@@ -127,7 +126,7 @@ class Tied:
 def contradicted(
     tied: Tied,
     regions: Sequence[ChangedRegion],
-    polygons: Sequence[Any],
+    polygons: Sequence[shapely.Geometry],
     surfaces: Surfaces,
 ) -> Contradicted:
     """Return which found regions points in common contradict, in each step between the epochs.
@@ -150,7 +149,7 @@ def contradicted(
     return Contradicted(tuple(whole), tuple(part))
 
 
-def _contradicted_share(step: Step, polygon: Any, surfaces: Surfaces, least_m: float) -> float:
+def _contradicted_share(step: Step, polygon: shapely.Geometry, surfaces: Surfaces, least_m: float) -> float:
     """Return the share of a polygon for which points speak that have not moved; 0: too few, or outvoted."""
     plan = surfaces.crs.xyz_from_lla(step.lla)[:, :2]
     inside = shapely.contains_xy(polygon, plan[:, 0], plan[:, 1])

@@ -24,6 +24,7 @@ from typing import IO, Any, TextIO
 from pipelines.core import errors
 from pipelines.core.files import storage_failure_of
 from pipelines.core.progress import SILENT, Progress, ProgressTask
+from pipelines.core.types import JsonValue
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +39,7 @@ class MessageSender:
     def __init__(self, stream: TextIO) -> None:
         self._stream, self._lock = stream, threading.Lock()
 
-    def send(self, kind: str, **content: Any) -> None:
+    def send(self, kind: str, **content: JsonValue) -> None:
         """Send one message; an OSError: nobody reads the stream."""
         with self._lock:
             self._stream.write(json.dumps({"kind": kind, **content}) + "\n")
@@ -74,7 +75,7 @@ class MessageReceiver:
         self._progress = progress
         self._open: list[tuple[AbstractContextManager[ProgressTask], ProgressTask]] = []
 
-    def take(self, message: Mapping[str, Any]) -> bool:
+    def take(self, message: Mapping[str, JsonValue]) -> bool:
         """Return whether a message was one of progress or of the log, and act on it."""
         match message["kind"]:
             case "log":
@@ -139,7 +140,7 @@ _MOST_OF_A_LINE = 300
 
 def run_in_child(
     task: str,
-    arguments: Mapping[str, Any],
+    arguments: Mapping[str, JsonValue],
     remedy: str,
     progress: Progress = SILENT,
     *,
@@ -199,7 +200,7 @@ def start_in_child(task: str) -> None:
     threading.Thread(target=run, daemon=True).start()
 
 
-def _follow(process: subprocess.Popen[str], arguments: Mapping[str, Any], progress: Progress) -> Any:
+def _follow(process: subprocess.Popen[str], arguments: Mapping[str, JsonValue], progress: Progress) -> Any:
     """Hand over the arguments, and follow the child's messages to its result; an EOFError: it ended without one."""
     assert process.stdin is not None
     assert process.stdout is not None
@@ -231,7 +232,7 @@ def _storage_failure(native_log: IO[str], folder: Path | None) -> errors.Storage
     return errors.storage_error_in(native_log.read(), folder) or storage_failure_of(folder)
 
 
-def _error(message: Mapping[str, Any]) -> Exception:
+def _error(message: Mapping[str, JsonValue]) -> Exception:
     if message["kind"] != "error":
         return RuntimeError(f"in a child process:\n{message['text']}")
     kind = getattr(errors, message["type"], errors.GeorefError)

@@ -18,6 +18,7 @@ from pipelines.core.options import InputMarker, StageOptions, flag_name, input_m
 from pipelines.core.product_parts import ProductPart
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import StageSpec
+from pipelines.core.types import JsonValue
 from pipelines.core.workspace import Workspace
 
 # A larger file, such as a bag, counts by its size and by samples: reading gigabytes for each `georef status` would
@@ -135,7 +136,7 @@ def _values(path: Path, part: ProductPart) -> dict[str, Any] | None:
     return {name: value for name, value in document.items() if name not in part.without}
 
 
-def _value(document: Any, keys: Sequence[str]) -> Any:
+def _value(document: JsonValue, keys: Sequence[str]) -> Any:
     """Return the value at a path of keys, through every item of a list; None where a key is missing."""
     if not keys or document is None:
         return document
@@ -144,7 +145,7 @@ def _value(document: Any, keys: Sequence[str]) -> Any:
     return _value(document.get(keys[0]), keys[1:]) if isinstance(document, dict) else None
 
 
-def _is_empty(value: Any) -> bool:
+def _is_empty(value: JsonValue) -> bool:
     if isinstance(value, dict):
         return all(_is_empty(item) for item in value.values())
     return value is None or (isinstance(value, list) and all(_is_empty(item) for item in value))

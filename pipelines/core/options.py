@@ -26,8 +26,10 @@ from pipelines.core.extras import Extra, require
 from pipelines.core.files import file_size, replace_text
 from pipelines.core.product_parts import ProductPart
 from pipelines.core.sentences import fault_sentence
-from pipelines.core.types import Vector3
+from pipelines.core.types import JsonValue, Vector3
 from pipelines.core.validators import require_text
+
+OptionValue = Any  # of its field's type, or as a file or the command line has it
 
 CONFIG_FILE = "georef.toml"
 _MAX_TOML_BYTES = 1024 * 1024
@@ -211,8 +213,8 @@ def names_of_flags(options_type: type[StageOptions], flags: Collection[str]) -> 
 
 def resolve(
     options_type: type[OptionsT],
-    table: Mapping[str, Any],
-    flags: Mapping[str, Any],
+    table: Mapping[str, OptionValue],
+    flags: Mapping[str, OptionValue],
     toml: Path,
     *,
     stage: str | None = None,
@@ -283,7 +285,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     return document
 
 
-def _require_integers(value: Any) -> None:
+def _require_integers(value: JsonValue) -> None:
     """Refuse integers beyond 64 bits, which TOML does not have."""
     if isinstance(value, int) and not -_INTEGERS <= value < _INTEGERS:
         raise ValueError
@@ -321,7 +323,7 @@ _PLACE = "workspace"  # no stage has this name
 def remembered(
     root: Path,
     stages: Iterable[str],
-    flags: Mapping[str, Mapping[str, Any]],
+    flags: Mapping[str, Mapping[str, OptionValue]],
     forget: Mapping[str, Collection[str]] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Return by stage the options last requested, but those to forget, overridden by flags."""
@@ -366,14 +368,14 @@ def read_requests(root: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def remember(root: Path, flags: Mapping[str, Mapping[str, Any]]) -> None:
+def remember(root: Path, flags: Mapping[str, Mapping[str, OptionValue]]) -> None:
     """Record the options that some stages are requested with, by stage."""
     requested = {**read_requests(root), **flags}
     document = {**{stage: dict(given) for stage, given in requested.items()}, _PLACE: {"root": str(root)}}
     replace_text(root / REQUESTS, json.dumps(document, indent=1, default=str) + "\n")
 
 
-def _moved(value: Any, before: Path, root: Path) -> Any:
+def _moved(value: JsonValue, before: Path, root: Path) -> Any:
     """Return a path that is gone as it lies beside a workspace that was at `before`; any other value as it is."""
     if not isinstance(value, str) or not Path(value).is_absolute():
         return value

@@ -7,17 +7,19 @@ Gaussians.
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, ValidationError
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, read_npz
 from pipelines.core.sentences import fault_sentence, with_remedy
-from pipelines.core.types import Matrix3, Quaternion
+from pipelines.core.types import JsonValue, Matrix3, Quaternion
 from pipelines.core.validators import covariance, image_name, unit_quaternion
 
 # Users may write products by hand: a file larger than any survey's is refused before it is read.
@@ -60,12 +62,12 @@ def load_json(product_type: type[ProductT], path: Path) -> ProductT:
         raise InputError("file-unreadable", f"cannot be read: {error.strerror}.", path=path) from error
 
 
-def dump_json(document: Any) -> str:
+def dump_json(document: JsonValue) -> str:
     """Return the JSON text of a plain document, also with remarks in it; it may hold no NaN and no infinity."""
     return json.dumps(document, indent=1, allow_nan=False, default=Remark.model_dump)
 
 
-def save_npz(path: Path, arrays: dict[str, Any]) -> None:
+def save_npz(path: Path, arrays: Mapping[str, ArrayLike]) -> None:
     """Write arrays by name into a file without compression; missing folders are made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, **{name: np.asarray(array) for name, array in arrays.items()})  # type: ignore[arg-type]

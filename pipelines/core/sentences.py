@@ -6,7 +6,8 @@ A terminal obeys escape sequences, and marks that turn the direction of writing 
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
-from typing import Any
+
+from pipelines.core.types import JsonValue
 
 _SHOWN = 8
 
@@ -16,7 +17,7 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + (" …" if len(names) > _SHOWN else "")
 
 
-def fault_sentence(fault: Mapping[str, Any]) -> str:
+def fault_sentence(fault: Mapping[str, JsonValue]) -> str:
     """Return the sentence of one of the errors of a pydantic `ValidationError`."""
     return str(fault["msg"]).removeprefix("Value error, ").removesuffix(".") + "."
 

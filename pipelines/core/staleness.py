@@ -10,13 +10,21 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.fingerprints import Fingerprints, fingerprints, hashes_of
 from pipelines.core.lock import WriteLock
 from pipelines.core.manifest import MANIFEST, Manifest, Memo
-from pipelines.core.options import StageOptions, as_flags, decisive_fields, load_toml, read_requests, resolve
+from pipelines.core.options import (
+    OptionValue,
+    StageOptions,
+    as_flags,
+    decisive_fields,
+    load_toml,
+    read_requests,
+    resolve,
+)
 from pipelines.core.product_parts import whole_products
 from pipelines.core.products import Remark, union
 from pipelines.core.progress import SILENT, Progress
@@ -38,7 +46,7 @@ log = logging.getLogger(__name__)
 
 BY_HAND = "put there by hand"
 State = Literal["missing", "current", "stale", "damaged", "running", "interrupted", "failed"]
-Flags = Mapping[str, Any]
+Flags = Mapping[str, OptionValue]
 
 
 @dataclass(frozen=True)
@@ -124,7 +132,7 @@ def is_made_from(workspace: Workspace, spec: StageSpec, products: Sequence[str],
     return all(present.get(product) == made.inputs.get(product) for product in products)
 
 
-def changed_options(options: StageOptions, config: Mapping[str, Any], but: Collection[str] = ()) -> str:
+def changed_options(options: StageOptions, config: Flags, but: Collection[str] = ()) -> str:
     """Return which options but those of `but` differ from recorded ones, as a reason; empty if none does."""
     try:
         before = type(options).model_validate(config)

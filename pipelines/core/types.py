@@ -14,9 +14,16 @@ Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 ByteArray = NDArray[np.uint8]
+AnyArray = NDArray[Any]  # of any type
+
+JsonValue = Any  # of JSON, TOML or YAML: an object, list, text, number, truth value or nothing
+Json = dict[str, JsonValue]  # object
+
+# `FunctionCtx` of torch, whose class declares neither `saved_tensors` nor what a forward pass keeps.
+AutogradContext = Any
 
 # Arrays of kernels, named by their shapes: N rows, K columns, an image of H × W pixels with C channels. Numba
-# compiles a kernel for the precision that it is given.
+# compiles a kernel for the precision that it is given, `float32/64` beside an argument.
 ArrayN = NDArray[Any]
 ArrayN3 = NDArray[Any]
 ArrayN4 = NDArray[Any]

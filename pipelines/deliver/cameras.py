@@ -19,13 +19,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.files import replace_text
 from pipelines.core.products import Remark, is_checked, save_npz, union
 from pipelines.core.stages import GAUSSIANS
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, Json
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportCamerasOptions
 from pipelines.deliver.placement import Placement, median_values, require_space, scene_sigma, solved_placement
@@ -34,7 +35,7 @@ from pipelines.formats.cloud_ply import write_point_ply
 from pipelines.formats.colmap import write_sparse
 from pipelines.formats.georef_sidecar import CrsSidecar, median_sigma, write_sidecar
 from pipelines.formats.tables import table_text
-from pipelines.formats.vector_files import Json, feature, features_text, polygon
+from pipelines.formats.vector_files import feature, features_text, polygon
 from pipelines.geodesy.crs import grid_from_enu, parse_crs
 from pipelines.geodesy.enu import geo_from_enu_at, lla_from_ecef, lla_from_enu
 from pipelines.geometry.cameras import Camera, CameraPoses, Pinhole, undistort
@@ -193,7 +194,7 @@ def _write_covariances(folder: Path, model: SparseModel, posterior: Posterior | 
         in_geo = file_from_geo.inverse().apply(position)
         of_points = posterior.of_tie_points(in_geo, place[model.obs_point[seen]], model.obs_image[seen])
         of_cameras, of_points = both @ posterior.camera_cov @ both.T, turn @ of_points @ turn.T
-    arrays = {
+    arrays: dict[str, ArrayLike] = {
         "camera_name": model.image_name,
         "camera_cov": of_cameras,
         "point_id": model.point_id[chosen],

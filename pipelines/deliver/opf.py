@@ -22,13 +22,13 @@ from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import DegenerateGeometryError, InputError
 from pipelines.core.products import Remark, is_checked, union
 from pipelines.core.stages import MODEL, OPF
-from pipelines.core.types import BoolArray, FloatArray, rows_of
+from pipelines.core.types import BoolArray, FloatArray, Json, rows_of
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportOpfOptions
 from pipelines.deliver.splat import load_splat
 from pipelines.deliver.surface import shared_squares, surface_views
 from pipelines.formats.georef_sidecar import write_sidecar
-from pipelines.formats.opf_gltf import Json, SurfaceWriter
+from pipelines.formats.opf_gltf import SurfaceWriter
 from pipelines.formats.opf_writer import (
     POINT_CLOUD,
     SPLATS,

@@ -16,11 +16,11 @@ from pipelines.core.figures import Headline
 from pipelines.core.products import Remark
 from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, REPORT, StageSpec
 from pipelines.core.staleness import StageState, cautions_by_stage, document_of_cautions, status
-from pipelines.core.types import FloatArray, Vector3, vector3
+from pipelines.core.types import FloatArray, Json, Vector3, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.placement import solved_placement
 from pipelines.formats.splat_ply import read_centres
-from pipelines.formats.vector_files import Json, feature, polygon
+from pipelines.formats.vector_files import feature, polygon
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.survey.headline import headline_of
 from pipelines.survey.navigation import load_survey

@@ -16,7 +16,7 @@ from scipy.ndimage import binary_erosion, label
 
 from pipelines import __version__
 from pipelines.core.progress import Progress
-from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
+from pipelines.core.types import AnyArray, BoolArray, ByteArray, FloatArray, IntArray, Json
 from pipelines.deliver.bands import Bands
 from pipelines.deliver.photo_colours import MARGIN, CellColours, PhotoColours
 from pipelines.deliver.raster_window import (
@@ -40,7 +40,7 @@ from pipelines.formats.geotiff import (
     write_part,
     write_vrt,
 )
-from pipelines.formats.vector_files import Json, feature
+from pipelines.formats.vector_files import feature
 from pipelines.surface.filling import FilledCells, fill_cells
 from pipelines.surface.ground import GroundModel
 from pipelines.survey.measured_ground import MOST_FILLED, MeasuredGround
@@ -220,7 +220,7 @@ class Mosaic:
         folder: Path,
         frame: RasterFrame,
         target: TargetCrs,
-        polygon: Any,
+        polygon: shapely.Geometry,
         *,
         has_terrain: bool,
         fill: FillWidth | None,
@@ -481,7 +481,7 @@ class Mosaic:
                 rows = min(_WINDOW_PX, self.frame.rows - row)
                 yield _Window(column, row, self.frame.part(column, row, columns, rows))
 
-    def _write(self, folder: Path, window: _Window, bands: dict[str, NDArray[Any]]) -> None:
+    def _write(self, folder: Path, window: _Window, bands: dict[str, AnyArray]) -> None:
         for name, values in bands.items():
             write_part(self._part(folder, name, window), values, window.frame)
 

@@ -23,7 +23,7 @@ from pipelines.core.files import file_size, replace_text
 from pipelines.core.products import Remark
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import TILES_GLB
-from pipelines.core.types import FloatArray, joined_rows
+from pipelines.core.types import FloatArray, Json, joined_rows
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.options import Compression, ExportTilesOptions
 from pipelines.deliver.pages import TILESET, ScenePage, scene_page, write_scene_page
@@ -222,7 +222,7 @@ def write_whole(
 
 
 def write_glb(
-    path: Path, splat: SplatArrays, extras: dict[str, Any] | None = None, *, compression: Compression = "spz"
+    path: Path, splat: SplatArrays, extras: Json | None = None, *, compression: Compression = "spz"
 ) -> None:
     """Write N ≥ 1 Gaussians of an East-North-Up frame as a glb, with `extras` as its `asset.extras`.
 

@@ -7,7 +7,7 @@ topic only.
 
 import re
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 from pipelines.core.errors import InputError
 from pipelines.core.extras import require
 from pipelines.core.types import ByteArray
-from pipelines.formats.bag_files import BagFiles, has_data_files, message_counts, open_files
+from pipelines.formats.bag_files import (
+    BagConnection,
+    BagFiles,
+    BagStorage,
+    has_data_files,
+    message_counts,
+    open_files,
+)
 from pipelines.formats.bag_limits import refuse_large_chunk, unpacked
 from pipelines.formats.image_file import MAX_BYTES, MAX_PIXELS, header_size
 from pipelines.formats.px4_messages import DEFINITIONS
@@ -34,6 +41,8 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 _REPAIR = "repair it with `mcap recover` (mcap) or `ros2 bag reindex` (sqlite3, or metadata.yaml missing)"
 
 RosMessage = Any  # decoded; its fields are those of the definition of its type
+RosTypes = Mapping[str, Callable[..., RosMessage]]  # classes of messages by type
+_Definition = Any  # rosbags.interfaces.MessageDefinition
 
 
 class UndecodableError(ValueError):
@@ -96,7 +105,7 @@ class Bag:
             if links:
                 yield from self._messages_of(storage, links)
 
-    def _messages_of(self, storage: Any, links: list[Any]) -> Iterator[RawMessage]:
+    def _messages_of(self, storage: BagStorage, links: list[BagConnection]) -> Iterator[RawMessage]:
         stream = storage.messages(links)
         while True:
             try:
@@ -161,7 +170,7 @@ class Bag:
             raise UndecodableError(store)
         return store
 
-    def _make_store(self, kind: str, stated: Any | None, is_ros1: bool) -> Any:
+    def _make_store(self, kind: str, stated: _Definition | None, is_ros1: bool) -> Any:
         """Return a typestore that has `kind` by the bag's or a default definition, or the reason why none has."""
         if stated is not None:
             try:
@@ -252,7 +261,7 @@ def _refusal(path: Path, error: Exception) -> InputError:
 
 
 @lru_cache(maxsize=256)
-def _stated_store(definition: Any, kind: str) -> Any:
+def _stated_store(definition: _Definition, kind: str) -> Any:
     """Return a typestore with the types of a definition, in ROS's message language or in IDL.
 
     The code that decodes them is generated once.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -19,7 +19,13 @@ from typing import Any
 
 from pipelines.core.errors import InputError
 from pipelines.core.products import Remark
+from pipelines.core.types import JsonValue
 from pipelines.formats.bag_limits import bound_decompressors, check_file, check_files, unpack_file
+
+# Classes of rosbags, by name: a file that mentions one does not load the library.
+BagStorage = Any  # reader of one data file
+BagConnection = Any  # rosbags.interfaces.Connection
+_Schema = Any  # of a file of mcap
 
 _SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
 _STORAGE = {".mcap": "mcap", ".db3": "sqlite3"}
@@ -131,7 +137,7 @@ def _require_flat(text: str) -> None:
             raise ValueError("brackets are nested too deeply")
 
 
-def _quality(stated: Any) -> list[Any]:
+def _quality(stated: JsonValue) -> list[Any]:
     """Return the profiles of quality of service that a text or list states; none where it is damaged."""
     from rosbags.rosbag2.metadata import parse_qos
 
@@ -143,7 +149,7 @@ def _quality(stated: Any) -> list[Any]:
         return []
 
 
-def _stated(information: Any, path: Path) -> _Metadata:
+def _stated(information: Mapping[str, JsonValue], path: Path) -> _Metadata:
     packing = str(information.get("compression_format") or "").lower()
     if str(information.get("compression_mode") or "none").lower() != "none" and packing != "zstd":
         how = repr(packing) if packing else "a format that is not stated"
@@ -258,7 +264,7 @@ def _readers() -> dict[str, Any]:
 
     usual = storage_mcap.get_msgdef
 
-    def definition_of(schema: Any) -> Any:
+    def definition_of(schema: _Schema | None) -> Any:
         if schema is not None and schema.encoding == "ros1msg":
             return MessageDefinition(MessageDefinitionFormat.MSG, schema.data)
         return usual(schema)
@@ -299,7 +305,7 @@ def _readers() -> dict[str, Any]:
                 start_time=first if total else 2**63 - 1, end_time=last + 1 if total else 0, message_count=total
             )
 
-        def _named(self, link: Any, count: int) -> Any:
+        def _named(self, link: BagConnection, count: int) -> Any:
             """Return a connection with its count, and with its type as ROS 2 writes it."""
             name = self.channels[link.id].schema
             is_ros1 = any(each.name == name and each.encoding == "ros1msg" for each in self.schemas.values())
@@ -309,7 +315,9 @@ def _readers() -> dict[str, Any]:
                 msgcount=count, msgtype=normalize_msgtype(link.msgtype) if is_ros1 else link.msgtype
             )
 
-        def messages(self, connections: Any, start: Any = None, stop: Any = None) -> Any:
+        def messages(
+            self, connections: Collection[BagConnection], start: int | None = None, stop: int | None = None
+        ) -> Any:
             return super().messages(
                 connections, -1 if start is None else start, 2**63 - 1 if stop is None else stop
             )
@@ -321,7 +329,7 @@ def _readers() -> dict[str, Any]:
     return {"mcap": McapReader, "sqlite3": storage_sqlite3.Sqlite3Reader, ".bag": rosbag1.Reader}
 
 
-def _add_unlisted(bag: BagFiles, file: Path, storage: Any) -> None:
+def _add_unlisted(bag: BagFiles, file: Path, storage: BagStorage) -> None:
     """Add a file that `metadata.yaml` does not list, unless it is a copy of what was read."""
     topics = {link.topic for link in storage.connections if link.msgcount}
     middle = (storage.metadata.start_time + storage.metadata.end_time) // 2
@@ -340,7 +348,7 @@ def _add_unlisted(bag: BagFiles, file: Path, storage: Any) -> None:
         bag.notes.append(Remark(code="bag-file-not-listed", sentence=sentence))
 
 
-def message_counts(storages: list[Any]) -> dict[tuple[str, str], int]:
+def message_counts(storages: list[BagStorage]) -> dict[tuple[str, str], int]:
     """Return the number of messages by topic and type, as the data files state them."""
     counts: dict[tuple[str, str], int] = {}
     for link in (link for storage in storages for link in storage.connections):
@@ -371,7 +379,7 @@ def _note_differences(bag: BagFiles, metadata: _Metadata, storages: set[str]) ->
         bag.notes.append(Remark(code="bag-metadata-differs", sentence=sentence))
 
 
-def _quality_differs(storages: list[Any], topic: str, stated: Any) -> bool:
+def _quality_differs(storages: list[BagStorage], topic: str, stated: JsonValue) -> bool:
     wanted = _quality(stated)
     links = [link for storage in storages for link in storage.connections if link.topic == topic]
     return (bool(stated) and not wanted) or all(list(link.ext.offered_qos_profiles) != wanted for link in links)

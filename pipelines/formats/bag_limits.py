@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Collection, Iterator
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
@@ -107,7 +107,13 @@ def bound_decompressors() -> None:
     rosbag1.decompressors.update({"lz4": lz4, "bz2": bz2})
 
 
-def _unpacked_chunk(decompressor: Callable[[], Any], data: bytes, limit_bytes: int = MAX_CHUNK_BYTES) -> bytes:
+class _Decompressor(Protocol):
+    def decompress(self, data: bytes, max_length: int) -> bytes: ...
+
+
+def _unpacked_chunk(
+    decompressor: Callable[[], _Decompressor], data: bytes, limit_bytes: int = MAX_CHUNK_BYTES
+) -> bytes:
     chunk: bytes = decompressor().decompress(data, max_length=limit_bytes + 1)
     if len(chunk) > limit_bytes:
         raise ValueError(f"a chunk unpacks to more than {limit_bytes / 2**20:.0f} MiB")

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pipelines.core.types import FloatArray, IntArray
+from pipelines.formats.bag import RosTypes
 from pipelines.geometry.rotations import quat_xyzw_from_matrix
 
 IMAGE_TOPIC = "/uav/camera/image/compressed"
@@ -95,7 +96,7 @@ def _qos(topic: str) -> list[Any]:
     ]  # fmt: skip
 
 
-def _messages(flight: BagFlight, types: Any) -> Iterator[tuple[str, int, Any]]:
+def _messages(flight: BagFlight, types: RosTypes) -> Iterator[tuple[str, int, Any]]:
     """Yield (topic, stamp, message) by time; a photograph is read only when its message is due."""
     streams = [(FIX_TOPIC, flight.fix_stamp_ns), (IMU_TOPIC, flight.imu_stamp_ns)]
     streams += [(INFO_TOPIC, flight.image_stamp_ns), (IMAGE_TOPIC, flight.image_stamp_ns)]
@@ -110,12 +111,12 @@ def _messages(flight: BagFlight, types: Any) -> Iterator[tuple[str, int, Any]]:
         yield topic, stamp_ns, make[rank[k]](flight, types, int(index[k]), stamp_ns)
 
 
-def _header(types: Any, stamp_ns: int, frame: str) -> Any:
+def _header(types: RosTypes, stamp_ns: int, frame: str) -> Any:
     time = types["builtin_interfaces/msg/Time"](stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
     return types["std_msgs/msg/Header"](time, frame)
 
 
-def _fix(flight: BagFlight, types: Any, i: int, stamp_ns: int) -> Any:
+def _fix(flight: BagFlight, types: RosTypes, i: int, stamp_ns: int) -> Any:
     status = types["sensor_msgs/msg/NavSatStatus"](flight.fix_status, 1)
     cov = np.diag(np.square(flight.fix_sigma_enu_m)).ravel()
     return types["sensor_msgs/msg/NavSatFix"](
@@ -123,7 +124,7 @@ def _fix(flight: BagFlight, types: Any, i: int, stamp_ns: int) -> Any:
     )
 
 
-def _imu(flight: BagFlight, types: Any, i: int, stamp_ns: int) -> Any:
+def _imu(flight: BagFlight, types: RosTypes, i: int, stamp_ns: int) -> Any:
     vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
     attitude = quat_xyzw_from_matrix(flight.imu_enu_from_body[i] @ _FLU_FROM_FRD)
     rate, force = _FLU_FROM_FRD @ flight.imu_rate[i], _FLU_FROM_FRD @ flight.imu_force[i]
@@ -135,7 +136,7 @@ def _imu(flight: BagFlight, types: Any, i: int, stamp_ns: int) -> Any:
     )  # fmt: skip
 
 
-def _info(flight: BagFlight, types: Any, _i: int, stamp_ns: int) -> Any:
+def _info(flight: BagFlight, types: RosTypes, _i: int, stamp_ns: int) -> Any:
     camera = flight.camera
     # ROS counts pixels from the centre of the first one, COLMAP from its corner.
     focal, cx, cy = camera.focal_px, camera.center_px[0] - 0.5, camera.center_px[1] - 0.5
@@ -147,12 +148,12 @@ def _info(flight: BagFlight, types: Any, _i: int, stamp_ns: int) -> Any:
     )  # fmt: skip
 
 
-def _image(flight: BagFlight, types: Any, i: int, stamp_ns: int) -> Any:
+def _image(flight: BagFlight, types: RosTypes, i: int, stamp_ns: int) -> Any:
     data = np.frombuffer(flight.image_paths[i].read_bytes(), dtype=np.uint8)
     return types["sensor_msgs/msg/CompressedImage"](_header(types, stamp_ns, CAMERA), "jpeg", data)
 
 
-def _transforms(flight: BagFlight, types: Any, stamp_ns: int) -> Any:
+def _transforms(flight: BagFlight, types: RosTypes, stamp_ns: int) -> Any:
     vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
     transform, stamped = types["geometry_msgs/msg/Transform"], types["geometry_msgs/msg/TransformStamped"]
     transforms = []

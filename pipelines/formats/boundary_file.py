@@ -26,6 +26,7 @@ import shapely
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
 from pipelines.core.products import Remark
+from pipelines.core.types import JsonValue
 from pipelines.formats.kml import read_kml
 from pipelines.formats.vector_files import ReadLayer, read_layers
 
@@ -96,7 +97,7 @@ class _Shapes:
     crs_is_default: bool = False
 
 
-_Refusal = Callable[..., InputError]
+Refusal = Callable[..., InputError]
 
 
 def read_boundary(path: Path, *, field: str) -> Boundary:
@@ -150,12 +151,12 @@ def read_boundary(path: Path, *, field: str) -> Boundary:
     return Boundary(tuple(found), unit, suffix == ".dxf", remarks)
 
 
-def _no_boundary(refusal: _Refusal) -> InputError:
+def _no_boundary(refusal: Refusal) -> InputError:
     kinds = "GeoJSON (.geojson), GeoPackage (.gpkg), KML (.kml, .kmz) or DXF (.dxf)"
     return refusal("boundary-format", "is no boundary file that is known.", remedy=f"Give {kinds}.")
 
 
-def _unzipped(data: bytes, refusal: _Refusal) -> bytes:
+def _unzipped(data: bytes, refusal: Refusal) -> bytes:
     """Return the KML of a KMZ: the first in the order of the archive (OGC 12-007r2). Nothing is written to disk."""
     unreadable = partial(refusal, "boundary-unreadable")
     try:
@@ -178,7 +179,7 @@ def _unzipped(data: bytes, refusal: _Refusal) -> bytes:
     return document
 
 
-def _as_utf8(data: bytes, refusal: _Refusal) -> bytes:
+def _as_utf8(data: bytes, refusal: Refusal) -> bytes:
     """Return a text in UTF-8, whichever encoding its byte order mark, its zeros or its XML declaration tell."""
     encoding = next((name for mark, name in _MARKS.items() if data.startswith(mark)), "")
     if not encoding and b"\0" in data[:4]:  # UTF-16 without a mark: its first character is ASCII
@@ -193,7 +194,7 @@ def _as_utf8(data: bytes, refusal: _Refusal) -> bytes:
     raise refusal("boundary-encoding", f"is no text in {names[0].upper()}.", remedy="Save it as UTF-8.")
 
 
-def _geojson(data: bytes, refusal: _Refusal) -> _Shapes:
+def _geojson(data: bytes, refusal: Refusal) -> _Shapes:
     unreadable = partial(refusal, "boundary-unreadable")
     try:
         document = json.loads(data)
@@ -221,10 +222,10 @@ def _geojson(data: bytes, refusal: _Refusal) -> _Shapes:
     return _Shapes("", shapes, names[0])
 
 
-def _geometry(kind: str, coordinates: Any) -> list[Any]:
+def _geometry(kind: str, coordinates: JsonValue) -> list[Any]:
     """Return the polygons and lines of a geometry of GeoJSON; the reader of it catches what is malformed."""
 
-    def plan(places: Any) -> list[tuple[float, float]]:
+    def plan(places: JsonValue) -> list[tuple[float, float]]:
         return [(float(place[0]), float(place[1])) for place in places]
 
     if kind == "Polygon":
@@ -239,7 +240,7 @@ def _geometry(kind: str, coordinates: Any) -> list[Any]:
     raise ValueError(f"type {str(kind)[:40]}")
 
 
-def _crs_member(member: Any, refusal: _Refusal) -> str:
+def _crs_member(member: JsonValue, refusal: Refusal) -> str:
     """Return the CRS that a member `crs` of GeoJSON 2008 names; empty: that it is unknown."""
     if member is None:
         return ""
@@ -281,7 +282,7 @@ def _drawing_unit(data: bytes) -> tuple[str, float] | None:
     return None if binary is None else _DXF_UNITS.get(int.from_bytes(binary[1], "little"))
 
 
-def _check_finite(layer: _Shapes, refusal: _Refusal) -> None:
+def _check_finite(layer: _Shapes, refusal: Refusal) -> None:
     for number, shape in enumerate(layer.shapes, start=1):
         places = shapely.get_coordinates(shape)
         wrong = np.flatnonzero(~np.isfinite(places).all(axis=1))
@@ -321,7 +322,7 @@ def _with_areas(layers: list[_Shapes], name: str) -> tuple[list[BoundaryLayer], 
     return found, remarks
 
 
-def _simple_parts(shape: Any) -> Iterator[Any]:
+def _simple_parts(shape: shapely.Geometry) -> Iterator[Any]:
     pending = [shape]
     while pending:
         one = pending.pop()
@@ -331,12 +332,12 @@ def _simple_parts(shape: Any) -> Iterator[Any]:
             yield one
 
 
-def _is_ring(line: Any) -> bool:
+def _is_ring(line: shapely.LineString) -> bool:
     first, last = line.coords[0], line.coords[-1]
     return len(line.coords) > 3 and float(np.hypot(*np.subtract(first, last))) <= _ROUNDING * line.length
 
 
-def _area(part: Any) -> Any | None:
+def _area(part: shapely.Geometry) -> Any | None:
     if part.geom_type == "Polygon":
         return part
     return shapely.Polygon(part.coords) if part.geom_type == "LineString" and _is_ring(part) else None

@@ -29,7 +29,7 @@ from pipelines.formats.colmap_checks import (
     check_quaternions_text,
     quaternion_fault,
 )
-from pipelines.geometry.cameras import Camera, Reconstruction, pycolmap_module
+from pipelines.geometry.cameras import Camera, ColmapCamera, ColmapImage, Reconstruction, pycolmap_module
 from pipelines.geometry.sparse_model import SparseModel
 
 ROLLING_SHUTTER = "rolling_shutter.json"
@@ -205,7 +205,7 @@ def read_sparse(path: Path) -> SparseModel:
     return model
 
 
-def lens_of_colmap(camera: Any) -> Camera:
+def lens_of_colmap(camera: ColmapCamera) -> Camera:
     """Return a `pycolmap.Camera` as a lens."""
     return Camera(camera.model_name, int(camera.width), int(camera.height), np.array(camera.params, np.float64))
 
@@ -300,7 +300,7 @@ def _loaded(path: Path) -> Any:
         raise InputError("model-unreadable", f"COLMAP cannot read the model: {error}", path=path) from error
 
 
-def _observations(images: list[Any], point_ids: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+def _observations(images: list[ColmapImage], point_ids: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
     """Return flat arrays over all observations that belong to a point, sorted by point."""
     pycolmap = pycolmap_module()
     # A pinhole of unit focal length at the origin turns a list of pixels into an array in one call.

@@ -112,7 +112,10 @@ def _read_exr(path: Path) -> DepthImage:
     return DepthImage(_known(pixels), is_half=pixels.dtype == np.float16)
 
 
-def _exr_channels(file: Any) -> dict[str, np.ndarray]:
+_ExrFile = Any  # OpenEXR.File
+
+
+def _exr_channels(file: _ExrFile) -> dict[str, np.ndarray]:
     return {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
 
 

@@ -35,6 +35,8 @@ _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _LARGEST_CRS = 100_000  # characters
 
+_E57File = Any  # pye57.libe57.ImageFile
+
 
 @dataclass(frozen=True)
 class Scan:
@@ -85,7 +87,7 @@ class E57File:
         finally:
             file.close()
 
-    def _chunks_of(self, file: Any, scan: Scan, size: int) -> Iterator[CloudChunk]:
+    def _chunks_of(self, file: _E57File, scan: Scan, size: int) -> Iterator[CloudChunk]:
         from pye57 import libe57
 
         capacity, done = min(size, scan.count), 0

@@ -9,8 +9,9 @@ says the same to GIS catalogues.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +23,7 @@ from pipelines.core.figures import Headline
 from pipelines.core.files import replace_text
 from pipelines.core.products import Product, Remark
 from pipelines.core.sentences import without_folders
-from pipelines.core.types import Matrix4, Quaternion, Row7, Vector3, vector3
+from pipelines.core.types import JsonValue, Matrix4, Quaternion, Row7, Vector3, vector3
 from pipelines.formats.iso_metadata import (
     PLAN_SIGMA,
     STANDARD_ERROR,
@@ -62,7 +63,7 @@ class GeoreferenceSigma(Product):
     sigma_3d_m: float
 
 
-def _matrix_of(fields: dict[str, Any]) -> Matrix4 | None:
+def _matrix_of(fields: Mapping[str, JsonValue]) -> Matrix4 | None:
     if fields["crs_id"] is None:
         return None
     similarity = Similarity(fields["scale"], matrix_from_quat_xyzw(fields["rotation"]), np.array(fields["origin"]))

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,7 +19,10 @@ from numpy.typing import NDArray
 
 from pipelines.core.errors import GeorefError, InputError, storage_error, storage_error_in
 from pipelines.core.files import replacing, storage_failure_of
-from pipelines.core.types import BoolArray, ByteArray, FloatArray
+from pipelines.core.types import AnyArray, BoolArray, ByteArray, FloatArray
+
+if TYPE_CHECKING:
+    import shapely
 
 NODATA = -9999.0
 _CACHE_BYTES = 256 * 1024 * 1024
@@ -91,7 +94,7 @@ class RasterKind:
     bands: tuple[Band, ...]
 
 
-def write_part(path: Path, values: NDArray[Any], frame: RasterFrame) -> None:
+def write_part(path: Path, values: AnyArray, frame: RasterFrame) -> None:
     """Write cells (bands, rows, columns) of a part; NaN becomes `NODATA`. The file appears whole or not at all."""
     import rasterio
 
@@ -304,7 +307,7 @@ def _warped(path: Path, frame: RasterFrame, resampling: str) -> Iterator[Any]:
             yield warped
 
 
-def cells_inside(polygon: Any, frame: RasterFrame) -> BoolArray:
+def cells_inside(polygon: shapely.Geometry, frame: RasterFrame) -> BoolArray:
     """Return which cells (rows, columns) have their middle in a polygon of the frame's CRS."""
     from rasterio.features import rasterize
 

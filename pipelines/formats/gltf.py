@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import Float32Array, Vector3
+from pipelines.core.types import Float32Array, Json, Vector3
 from pipelines.formats.splat_ply import SplatArrays
 
 SPLATS = "KHR_gaussian_splatting"
@@ -39,7 +39,7 @@ _LEAST_OPACITY = 1e-7  # whose logit is finite in float32, as is that of 1 less 
 
 
 def encode_glb(
-    spz: bytes, count: int, sh_degree: int, bounds: tuple[Vector3, Vector3], extras: dict[str, Any] | None = None
+    spz: bytes, count: int, sh_degree: int, bounds: tuple[Vector3, Vector3], extras: Json | None = None
 ) -> bytes:
     """Return a glb of an SPZ file of version 2 or 3 in a z-up frame.
 
@@ -60,7 +60,7 @@ def encode_glb(
     return _glb(accessors, [{"buffer": 0, "byteLength": len(spz)}], spz, extras, is_spz=True)
 
 
-def encode_plain_glb(splat: SplatArrays, extras: dict[str, Any] | None = None) -> bytes:
+def encode_plain_glb(splat: SplatArrays, extras: Json | None = None) -> bytes:
     """Return a glb of N ≥ 1 Gaussians in a z-up frame whose attributes are plain arrays; `extras` as above.
 
     Raises:
@@ -156,10 +156,10 @@ def _harmonics(first: int, last: int) -> list[str]:
 
 
 def _glb(
-    accessors: dict[str, dict[str, Any]],
-    views: list[dict[str, Any]],
+    accessors: dict[str, Json],
+    views: list[Json],
     payload: bytes,
-    extras: dict[str, Any] | None,
+    extras: Json | None,
     *,
     is_spz: bool = False,
 ) -> bytes:
@@ -183,9 +183,7 @@ def _glb(
     return glb_of(primitive, document, payload, extras)
 
 
-def glb_of(
-    primitive: dict[str, Any], rest: dict[str, Any], binary: bytes, extras: dict[str, Any] | None = None
-) -> bytes:
+def glb_of(primitive: Json, rest: Json, binary: bytes, extras: Json | None = None) -> bytes:
     """Return a glb of one primitive in a z-up frame, which a node turns y-up; a ValueError: 4 GiB or more.
 
     `rest` is the rest of the glTF document but for its only buffer, and `extras` metadata for `asset.extras`.

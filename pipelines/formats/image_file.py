@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, reading
+from pipelines.core.types import AnyArray
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
 HEIF_SUFFIXES = frozenset({".heic", ".heif"})  # converted by `ingest`: see `formats.heif`
@@ -273,7 +274,7 @@ def _decoded(data: bytes, flags: int) -> NDArray[Any] | None:
         return None
 
 
-def _extremes(pixels: NDArray[Any]) -> tuple[float, float]:
+def _extremes(pixels: AnyArray) -> tuple[float, float]:
     """Return the values that all but one pixel in ten thousand at each end lie between; zeros without a number."""
     values = pixels[np.isfinite(pixels)] if pixels.dtype.kind == "f" else pixels.ravel()
     if not values.size:
@@ -283,7 +284,7 @@ def _extremes(pixels: NDArray[Any]) -> tuple[float, float]:
     return float(ends[beyond]), float(ends[values.size - 1 - beyond])
 
 
-def _miniature(pixels: NDArray[Any], values: tuple[float, float] | None) -> bytes:
+def _miniature(pixels: AnyArray, values: tuple[float, float] | None) -> bytes:
     import cv2
 
     small = cv2.resize(_grey_values(pixels), (_MINIATURE_PX, _MINIATURE_PX), interpolation=cv2.INTER_AREA)
@@ -292,7 +293,7 @@ def _miniature(pixels: NDArray[Any], values: tuple[float, float] | None) -> byte
     return bytes(np.clip((small - low) * scale, 0, 255).astype(np.uint8).tobytes())
 
 
-def _sharpness(pixels: NDArray[Any], values: tuple[float, float] | None) -> float:
+def _sharpness(pixels: AnyArray, values: tuple[float, float] | None) -> float:
     import cv2
 
     grey = _grey_values(pixels)
@@ -301,6 +302,6 @@ def _sharpness(pixels: NDArray[Any], values: tuple[float, float] | None) -> floa
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
 
 
-def _grey_values(pixels: NDArray[Any]) -> NDArray[Any]:
+def _grey_values(pixels: AnyArray) -> NDArray[Any]:
     grey = pixels.astype(np.float32) if pixels.ndim == 2 else pixels.mean(axis=2, dtype=np.float32)
     return np.asarray(np.nan_to_num(grey))

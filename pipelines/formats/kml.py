@@ -74,7 +74,7 @@ class _Reader:
         elif name == "Track":
             self._track = []
 
-    def entity(self, name: str, *_: Any) -> None:
+    def entity(self, name: str, *_: object) -> None:
         raise self._refusal(
             "boundary-entities", f"declares the entity {name[:40]}, which is not read.", remedy="Remove it."
         )

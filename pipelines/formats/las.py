@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -158,7 +158,7 @@ def _opened(path: Path, head: LasHead) -> laspy.LasReader:
     return laspy.open(source, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs)
 
 
-def _chunk(record: Any) -> CloudChunk:
+def _chunk(record: laspy.ScaleAwarePointRecord) -> CloudChunk:
     names = set(record.point_format.dimension_names)
     classification = np.asarray(record.classification, dtype=np.uint8)
 

@@ -1,13 +1,12 @@
 """Files of triangle meshes: PLY with colours of the vertices, binary glTF and OBJ with a texture."""
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from pipelines.core.types import ByteArray, FloatArray, IntArray
+from pipelines.core.types import ByteArray, FloatArray, IntArray, Json
 from pipelines.formats.cloud_ply import COLOURS, set_columns
 from pipelines.formats.gltf import glb_of
 
@@ -83,7 +82,7 @@ def texture_png(image: ByteArray) -> bytes:
 
 
 def write_mesh_glb(
-    path: Path, vertices: FloatArray, faces: IntArray, uv: FloatArray, image: ByteArray, *, extras: dict[str, Any]
+    path: Path, vertices: FloatArray, faces: IntArray, uv: FloatArray, image: ByteArray, *, extras: Json
 ) -> None:
     """Write vertices (V, 3) of a z-up frame with a texture (H, W, 3) as a glb, which a node turns y-up.
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, reading
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray, Json
 from pipelines.formats.cloud_ply import check_precision
 from pipelines.formats.triangle_mesh import MOST_BYTES, MOST_FACES, TriangleMesh, mesh_of
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
@@ -84,7 +84,7 @@ def _chunks(data: bytes, path: Path, size: int) -> tuple[dict[str, Any], memoryv
 class _Scene:
     """Document and binary chunk of one glb."""
 
-    def __init__(self, path: Path, document: dict[str, Any], binary: memoryview) -> None:
+    def __init__(self, path: Path, document: Json, binary: memoryview) -> None:
         self.path, self.document, self.binary = path, document, binary
         self.vertices: list[FloatArray] = []
         self.faces: list[IntArray] = []
@@ -158,7 +158,7 @@ class _Scene:
             self.read[number, part] = self._decoded(self.document["meshes"][number]["primitives"][part])
         return self.read[number, part]
 
-    def _decoded(self, primitive: dict[str, Any]) -> tuple[FloatArray, IntArray] | None:
+    def _decoded(self, primitive: Json) -> tuple[FloatArray, IntArray] | None:
         mode = primitive.get("mode", _TRIANGLES)
         if mode not in {_TRIANGLES, _STRIP, _FAN} or "POSITION" not in primitive["attributes"]:
             return None
@@ -215,7 +215,7 @@ def _is_earth_centred(center: FloatArray) -> bool:
     return bool(center[2] != 0 and _EARTH_M[0] < np.linalg.norm(center) < _EARTH_M[1])
 
 
-def _matrix(node: dict[str, Any]) -> FloatArray:
+def _matrix(node: Json) -> FloatArray:
     """Return the matrix (4, 4) of a node, parent ← node; a ValueError: not 16 finite numbers."""
     if "matrix" in node:
         matrix = np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T

@@ -9,17 +9,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.core.files import remove, replace_text
 from pipelines.core.products import dump_json
-from pipelines.core.types import ByteArray, Float32Array, FloatArray
+from pipelines.core.types import AnyArray, ByteArray, Float32Array, FloatArray, Json
 from pipelines.formats.gltf import Y_UP_FROM_Z_UP
-
-Json = dict[str, Any]
 
 GLTF, BUFFER = "model/gltf+json", "application/gltf-buffer+bin"
 _COMPONENTS = {"f": 5126, "u": 5125, "B": 5121}
@@ -46,7 +43,7 @@ class ArrayFile:
     more: Json = field(default_factory=dict)
 
     @classmethod
-    def of(cls, folder: Path, name: str, values: NDArray[Any]) -> ArrayFile:
+    def of(cls, folder: Path, name: str, values: AnyArray) -> ArrayFile:
         """Write an array (N,) or (N, width), and return its file."""
         kind = {"f": "f", "u": "B" if values.dtype.itemsize == 1 else "u"}[values.dtype.kind]
         (folder / f"{name}.bin").write_bytes(np.ascontiguousarray(values, _DTYPES[kind]).tobytes())

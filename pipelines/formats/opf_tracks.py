@@ -20,7 +20,7 @@ from pydantic.alias_generators import to_camel
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, reading
 from pipelines.core.products import load_json
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, JsonValue
 from pipelines.formats.solved_cameras import Foreign, TiePoints, vector_of
 
 MATCHES = "OPF_mesh_primitive_matches"
@@ -148,7 +148,7 @@ class _File:
     document: _Gltf
     beside: Callable[[str, Path], Path]
 
-    def one(self, items: list[Any], index: int, what: str) -> Any:
+    def one(self, items: list[JsonValue], index: int, what: str) -> Any:
         if not 0 <= index < len(items):
             message = f"There is no {what} {index}: the file has {len(items)}."
             raise InputError("index-missing", message, path=self.path, field=what)

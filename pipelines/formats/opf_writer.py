@@ -24,9 +24,9 @@ import numpy as np
 from pipelines import __version__
 from pipelines.core.files import replace_text
 from pipelines.core.products import dump_json
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, Json
 from pipelines.formats.camera_files import lens_of
-from pipelines.formats.opf_gltf import ArrayFile, Json, write_points
+from pipelines.formats.opf_gltf import ArrayFile, write_points
 from pipelines.formats.opf_tracks import MATCHES
 from pipelines.geometry.cameras import Camera, distort, parameters_in, undistort
 from pipelines.geometry.rotations import omega_phi_kappa_deg

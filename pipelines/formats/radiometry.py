@@ -19,12 +19,11 @@ import math
 import re
 import struct
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.core.types import Float32Array, FloatArray
+from pipelines.core.types import AnyArray, Float32Array, FloatArray
 from pipelines.formats.exif import PhotoTags
 from pipelines.formats.image_file import ImageHeader
 from pipelines.formats.xmp import Xmp
@@ -92,7 +91,7 @@ class Radiometry:
     missing: tuple[str, ...] = ()
     float_degrees: bool = False
 
-    def values(self, pixels: NDArray[Any]) -> Float32Array:
+    def values(self, pixels: AnyArray) -> Float32Array:
         """Return the values (H, W) of stored pixels (H, W), in the unit of the quantity."""
         value = self.scale * (pixels.astype(np.float64) - self.black)
         if self.vignetting is not None:

@@ -20,11 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipelines.core.errors import InputError, StorageError, storage_error_in
 from pipelines.core.files import file_size, replacing, storage_failure_of
-from pipelines.core.types import FloatArray
+from pipelines.core.types import AnyArray, FloatArray, Json, JsonValue
 from pipelines.formats.vector_source import gdal, layers_with_shapes, reading_errors, rows_of_table, tables_alone
 from pipelines.geometry.footprints import clipped_ring, ring_area
 
-Json = dict[str, Any]
 _DECIMALS = 8  # of a degree: 1 mm
 _MOST_CONTOUR_BYTES = 1 << 30
 _MINOR, _MAJOR = "CONTOURS", "CONTOURS_MAJOR"
@@ -51,7 +50,9 @@ def polygon(lon_lat: ArrayLike) -> Json | None:
     return {"type": "MultiPolygon", "coordinates": [[one] for one in rings]}
 
 
-def feature(geometry: Json | None, properties: Mapping[str, Any], bbox: Sequence[float] | None = None) -> Json:
+def feature(
+    geometry: Json | None, properties: Mapping[str, JsonValue], bbox: Sequence[float] | None = None
+) -> Json:
     """Return a feature; NaN among the properties becomes null."""
     box = {} if bbox is None else {"bbox": list(bbox)}
     known = dict(properties)
@@ -116,7 +117,13 @@ def _new_gpkg(path: Path) -> Iterator[Path]:
 
 
 def _add_layer(
-    draft: Path, layer: str, shapes: Sequence[Any], columns: Mapping[str, NDArray[Any]], *, kind: str, crs: str
+    draft: Path,
+    layer: str,
+    shapes: Sequence[shapely.Geometry | None],
+    columns: Mapping[str, AnyArray],
+    *,
+    kind: str,
+    crs: str,
 ) -> None:
     """Write a layer of shapes, whose values are the columns, into a GeoPackage 1.2, which is made if missing.
 
@@ -236,7 +243,9 @@ def _read_gpkg(
         raise InputError(f"{layer}-unreadable", message, path=path, remedy=remedy) from error
 
 
-def write_polygons_gpkg(path: Path, layers: Mapping[str, tuple[Sequence[Any], Sequence[Json]]], wkt: str) -> None:
+def write_polygons_gpkg(
+    path: Path, layers: Mapping[str, tuple[Sequence[shapely.Geometry], Sequence[Json]]], wkt: str
+) -> None:
     """Write layers of polygons, with a row of attributes each, as a GeoPackage 1.2."""
     with _new_gpkg(path) as draft:
         for layer, (polygons, rows) in layers.items():

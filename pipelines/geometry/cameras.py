@@ -53,6 +53,10 @@ _MISSED_PX = (
 # Classes of pycolmap, by name: a file that mentions one does not load the library.
 Reconstruction = Any
 ColmapDatabase = Any
+ColmapCamera = Any
+ColmapImage = Any
+BundleOptions = Any  # pycolmap.BundleAdjustmentOptions
+BundleConfig = Any  # pycolmap.BundleAdjustmentConfig
 
 
 def pycolmap_module() -> Any:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pipelines.core.types import FloatArray, Quaternion, Vector3, vector3
 from pipelines.formats.bag import RosMessage
@@ -131,7 +132,9 @@ def _geodetic_problem(coordinates: Sequence[float]) -> str:
     return IMPOSSIBLE_HEIGHT if impossible_heights(alt) else ""
 
 
-def _local(position: Any, message: RosMessage, frame: str = "", covariance: Any = None) -> PositionSample:
+def _local(
+    position: RosMessage, message: RosMessage, frame: str = "", covariance: ArrayLike | None = None
+) -> PositionSample:
     values = np.array([position.x, position.y, position.z], dtype=np.float64)
     variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[0, 7, 14]]
     if str(message.header.frame_id).lower().endswith("_ned"):
@@ -156,7 +159,7 @@ def _px4_local(message: RosMessage) -> PositionSample:
     return PositionSample(coordinates, sigma, BASE, world="PX4's local NED", problem=problem)
 
 
-def _sigmas(variance: Any) -> Vector3:
+def _sigmas(variance: ArrayLike) -> Vector3:
     """Return σ of three variances; all NaN where one is not positive, or beyond `_LARGEST_SIGMA_M`."""
     values = np.asarray(variance, dtype=np.float64)
     if not (np.isfinite(values).all() and (values > 0).all() and (values < _LARGEST_SIGMA_M**2).all()):
@@ -183,7 +186,9 @@ def _imu(message: RosMessage) -> AttitudeSample:
     return _attitude(message.orientation, covariance[[0, 4, 8]], frame or BASE, ned, unknown)
 
 
-def _pose(orientation: Any, message: RosMessage, frame: str = "", covariance: Any = None) -> AttitudeSample:
+def _pose(
+    orientation: RosMessage, message: RosMessage, frame: str = "", covariance: ArrayLike | None = None
+) -> AttitudeSample:
     variance = np.zeros(3) if covariance is None else np.asarray(covariance, dtype=np.float64)[[21, 28, 35]]
     ned = str(message.header.frame_id).lower().endswith("_ned")
     return _attitude(orientation, variance, frame or BASE, ned)
@@ -194,7 +199,9 @@ def _px4_odometry(message: RosMessage) -> AttitudeSample:
     return attitude if _px4_is_ned(message) else replace(attitude, problem="its frame is not North-East-Down")
 
 
-def _attitude(quaternion: Any, variance: Any, frame: str, ned: bool, unknown: bool = False) -> AttitudeSample:
+def _attitude(
+    quaternion: RosMessage, variance: ArrayLike, frame: str, ned: bool, unknown: bool = False
+) -> AttitudeSample:
     values = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], dtype=np.float64)
     problem = "has no orientation" if unknown or not values.any() else _quaternion_problem(values)
     if ned and not problem:
@@ -203,7 +210,7 @@ def _attitude(quaternion: Any, variance: Any, frame: str, ned: bool, unknown: bo
     return AttitudeSample((x, y, z, w), _sigma_deg(variance), frame, body_axes(frame), problem)
 
 
-def _from_ned_frd(quat_wxyz: Any, variance: Any) -> AttitudeSample:
+def _from_ned_frd(quat_wxyz: Iterable[float], variance: ArrayLike) -> AttitudeSample:
     w, x, y, z = (float(value) for value in quat_wxyz)
     values = np.array([x, y, z, w])
     problem = _quaternion_problem(values)
@@ -221,7 +228,7 @@ def _quaternion_problem(values: np.ndarray) -> str:
     return "" if abs(float(np.linalg.norm(values)) - 1.0) < 0.05 else "orientation is no unit quaternion"
 
 
-def _sigma_deg(variance: Any) -> float:
+def _sigma_deg(variance: ArrayLike) -> float:
     values = np.asarray(variance, dtype=np.float64)
     if not (np.isfinite(values).all() and (values > 0).all()):
         return math.nan

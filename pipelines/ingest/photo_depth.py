@@ -9,14 +9,12 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.core.errors import InputError
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import ByteArray
+from pipelines.core.types import AnyArray, ByteArray
 from pipelines.formats.image_file import deep_pixels, inspect_image, read_bytes
 from pipelines.ingest.flight_record import FlightRecord
 from pipelines.ingest.photo_folder import Photo
@@ -34,7 +32,7 @@ class _Scale:
     high: float
     bits: int
 
-    def to_bytes(self, pixels: NDArray[Any]) -> ByteArray:
+    def to_bytes(self, pixels: AnyArray) -> ByteArray:
         # What is no number, as outside of an orthophoto, becomes black.
         values = np.nan_to_num(pixels.astype(np.float32), nan=self.low, posinf=self.high, neginf=self.low)
         share = (values - self.low) / (self.high - self.low)

@@ -21,6 +21,7 @@ from urllib.parse import SplitResult, urlsplit
 
 from pipelines.core.errors import ClusterError, InputError
 from pipelines.core.extras import require
+from pipelines.core.types import JsonValue
 from pipelines.jobs.engine import Job
 
 if TYPE_CHECKING:
@@ -252,7 +253,7 @@ class Worker:
     gpus: int
 
 
-def workers_of(described: Mapping[str, Mapping[str, Any]]) -> dict[str, Worker]:
+def workers_of(described: Mapping[str, Mapping[str, JsonValue]]) -> dict[str, Worker]:
     """Return the workers that offer memory to jobs, by address, as the scheduler has described them."""
     return {
         address: Worker(

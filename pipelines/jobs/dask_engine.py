@@ -12,13 +12,14 @@ import math
 import queue
 import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from pipelines import __version__
 from pipelines.core.errors import ClusterError, WorkspaceBusyError
 from pipelines.core.progress import Progress, ProgressTask, StopRequest, deferred_interrupts
+from pipelines.core.types import JsonValue
 from pipelines.jobs.cluster import GPU, MEMORY, ClusterAddress, Worker, connected, worker_for, workers_of
 from pipelines.jobs.dask_task import UNFIT, JobRequest, folder_tokens, run_job
 from pipelines.jobs.engine import INTERRUPTED, Job, JobDisplay, JobEnd, tell_end
@@ -194,7 +195,7 @@ class ClusterRun:
         except queue.Empty:
             return
 
-    def _take(self, event: dict[str, Any], is_stopping: bool) -> None:
+    def _take(self, event: Mapping[str, JsonValue], is_stopping: bool) -> None:
         name = event["attempt"]
         attempt = self._running.get(name)
         if attempt is None:  # It has ended.

@@ -22,6 +22,7 @@ from pipelines.core import child
 from pipelines.core.child import python_environment
 from pipelines.core.errors import GeorefError
 from pipelines.core.machine import available_cores
+from pipelines.core.types import JsonValue
 from pipelines.jobs.cluster import CORES, GPU, MEMORY, ClusterAddress
 from pipelines.jobs.local import JobProcess, ProcessEnd
 from pipelines.jobs.storage import Parcel, arguments_in, worker_exchange
@@ -66,7 +67,10 @@ def _obstacle(request: JobRequest) -> ProcessEnd | None:
     return None
 
 
-def _run_where_its_files_are(worker: Any, request: JobRequest, events: _Events) -> ProcessEnd:
+_DaskWorker = Any  # distributed.Worker
+
+
+def _run_where_its_files_are(worker: _DaskWorker, request: JobRequest, events: _Events) -> ProcessEnd:
     parcel, arguments = request["parcel"], request["arguments"]
     if parcel is None:
         return _run(worker, arguments, events)
@@ -79,7 +83,7 @@ def _run_where_its_files_are(worker: Any, request: JobRequest, events: _Events) 
         return ProcessEnd(1, time.monotonic() - started, str(error), error.kind)
 
 
-def _run(worker: Any, arguments: Sequence[str], events: _Events) -> ProcessEnd:
+def _run(worker: _DaskWorker, arguments: Sequence[str], events: _Events) -> ProcessEnd:
     ends: queue.Queue[ProcessEnd] = queue.Queue()
     key = worker.get_current_task()
     cores = int(worker.state.total_resources.get(CORES, available_cores()))
@@ -104,12 +108,12 @@ def _run(worker: Any, arguments: Sequence[str], events: _Events) -> ProcessEnd:
 class _Events:
     """Sender of a job's messages; steps that follow each other are added up, so that many become few."""
 
-    def __init__(self, worker: Any, request: JobRequest) -> None:
+    def __init__(self, worker: _DaskWorker, request: JobRequest) -> None:
         self._worker, self._request = worker, request
         self._lock = threading.Lock()
         self._messages: list[dict[str, Any]] = []
 
-    def take(self, message: Mapping[str, Any]) -> bool:
+    def take(self, message: Mapping[str, JsonValue]) -> bool:
         """Return whether a message was one of progress or of the log, and keep it until `flush`."""
         if message["kind"] not in _SENT:
             return False
@@ -125,7 +129,7 @@ class _Events:
                 self._messages.append(dict(message))
         return True
 
-    def flush(self, **content: Any) -> None:
+    def flush(self, **content: JsonValue) -> None:
         """Send the messages that were kept, and one event with this content, if any."""
         with self._lock:
             messages, self._messages = self._messages, []

@@ -25,6 +25,7 @@ from pipelines.core import child
 from pipelines.core.child import python_command, python_environment
 from pipelines.core.machine import free_main_memory_bytes, thread_count
 from pipelines.core.progress import Progress, deferred_interrupts
+from pipelines.core.types import JsonValue
 from pipelines.jobs.engine import INTERRUPTED, Engine, Job, JobDisplay, JobEnd, tell_end
 
 log = logging.getLogger(__name__)
@@ -58,7 +59,7 @@ class JobProcess:
         program: Sequence[str],
         arguments: Sequence[str],
         threads: int,
-        take: Callable[[Mapping[str, Any]], bool],
+        take: Callable[[Mapping[str, JsonValue]], bool],
         ended: Callable[[ProcessEnd], None],
     ) -> None:
         self._take, self._ended = take, ended

@@ -19,6 +19,7 @@ from pipelines.core.options import CONFIG_FILE, REQUESTS, input_markers, load_to
 from pipelines.core.sentences import fault_sentence
 from pipelines.core.stages import BY_NAME, StageSpec, named_deliverables, stage_slice
 from pipelines.core.staleness import Flags
+from pipelines.core.types import JsonValue
 from pipelines.core.validators import stays_inside
 from pipelines.core.workspace import Workspace
 
@@ -152,7 +153,7 @@ class _Table:
     name: str
     owners: Owners
 
-    def read(self, table: Any) -> _Settings:
+    def read(self, table: JsonValue) -> _Settings:
         """Return the content of the table, or raise an InputError for an unknown key or a bad value."""
         if not isinstance(table, dict):
             message = "is not a table."
@@ -179,7 +180,7 @@ class _Table:
                 raise self._error("unknown-option", key, message)
         return _Settings(texts, flags)
 
-    def _mission_text(self, key: str, value: Any) -> str:
+    def _mission_text(self, key: str, value: JsonValue) -> str:
         if not isinstance(value, str):
             raise self._error("not-a-text", key, "is not a text.")
         try:
@@ -196,7 +197,7 @@ class _Table:
             raise self._error(code, key, str(error)) from error
         return value
 
-    def _value(self, spec: StageSpec, option: str, value: Any, key: str) -> Any:
+    def _value(self, spec: StageSpec, option: str, value: JsonValue, key: str) -> Any:
         """Return the value of an option, with paths relative to the file made absolute."""
         if option not in spec.options.model_fields:
             known = ", ".join(spec.options.model_fields)
@@ -217,7 +218,7 @@ class _Table:
         return InputError(code, message, path=self.path, field=f"{self.name}.{key}")
 
 
-def _mission(path: Path, name: str, table: Any, defaults: _Settings, owners: Owners) -> Mission:
+def _mission(path: Path, name: str, table: JsonValue, defaults: _Settings, owners: Owners) -> Mission:
     label = f"missions.{name}"
     _require_name(name, path, label)
     stated = _Table(path, label, owners).read(table)
@@ -269,7 +270,7 @@ def _require_own_workspaces(path: Path, missions: Sequence[Mission]) -> None:
         taken[root] = mission.name
 
 
-def _texts(value: Any) -> Iterator[str]:
+def _texts(value: JsonValue) -> Iterator[str]:
     if isinstance(value, str):
         yield value
     elif isinstance(value, list):

@@ -27,7 +27,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.figures import ACCURACY_H, MISSING
 from pipelines.core.files import file_size
 from pipelines.core.sentences import duration, printable_lines, without_folders
-from pipelines.core.types import ByteArray
+from pipelines.core.types import ByteArray, JsonValue
 from pipelines.formats.image_file import MAX_PIXELS, header_size, read_bytes
 
 
@@ -189,7 +189,7 @@ def render_page(page: Page, room: str) -> str:
     return environment.get_template("frame.html").render(page=page, document=page.document)
 
 
-def value_at(document: Any, path: str) -> Any:
+def value_at(document: JsonValue, path: str) -> Any:
     """Return the value at a path of keys and indices: `checkpoints.triangulated.points.3.de_m`.
 
     None where a part on the way is None: a part of a report that does not exist has no figures.

@@ -30,7 +30,8 @@ from pipelines.core.stages import (
     REFERENCE_MAP,
     StageSpec,
 )
-from pipelines.core.staleness import cautions_by_stage, status
+from pipelines.core.staleness import Flags, cautions_by_stage, status
+from pipelines.core.types import JsonValue
 from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import (
     CrsSidecar,
@@ -124,7 +125,7 @@ def record_facts(workspace: Workspace, survey: Survey) -> RecordFacts:
     )
 
 
-def _options(spec: StageSpec, config: Mapping[str, Any]) -> dict[str, str]:
+def _options(spec: StageSpec, config: Flags) -> dict[str, str]:
     """Return the recorded options of a stage by flag, as users write their values."""
     try:
         options = spec.options.model_validate(config)
@@ -265,7 +266,7 @@ def _values(workspace: Workspace, stage: str) -> dict[str, Any]:
     return {} if manifest is None else manifest.values
 
 
-def _file(file: Path, path: str, description: str, values: dict[str, Any]) -> DeliveredFile:
+def _file(file: Path, path: str, description: str, values: Mapping[str, JsonValue]) -> DeliveredFile:
     crs, heights, sigma = _stated_place(file)
     shares = _shares(values) if crs and path != "export/splat.ply" else ""
     if file.name in _DRAWN_OF:  # it has no sidecar of its own
@@ -316,7 +317,7 @@ def _sigma(horizontal_m: float, vertical_m: float) -> str:
     return f"H {length_text(horizontal_m)}, V {length_text(vertical_m)}"
 
 
-def _cell(file: Path, values: dict[str, Any]) -> str:
+def _cell(file: Path, values: Mapping[str, JsonValue]) -> str:
     try:
         step = raster_frame(file).step_x
     except GeorefError:
@@ -325,7 +326,7 @@ def _cell(file: Path, values: dict[str, Any]) -> str:
     return f"{step:g} {unit}"
 
 
-def _shares(values: dict[str, Any]) -> str:
+def _shares(values: Mapping[str, JsonValue]) -> str:
     measured, interpolated = values.get("measured"), values.get("interpolated")
     if not isinstance(measured, float | int):
         return ""

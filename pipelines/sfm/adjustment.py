@@ -28,7 +28,7 @@ from pipelines.core.errors import ConvergenceError
 from pipelines.core.progress import SILENT, Progress, ProgressTask
 from pipelines.core.types import FloatArray, Vector3
 from pipelines.formats.colmap import flatten
-from pipelines.geometry.cameras import Reconstruction, project_each
+from pipelines.geometry.cameras import BundleConfig, BundleOptions, ColmapImage, Reconstruction, project_each
 from pipelines.geometry.similarity import Similarity, umeyama
 from pipelines.geometry.statistics import CAUCHY_95, CAUCHY_SCALE2, cauchy_weight, median_chi2, rayleigh_sigma
 
@@ -59,7 +59,7 @@ def adjust_finally(
     model: Reconstruction,
     *,
     fixes: Mapping[str, Vector3] | None = None,
-    complete: Callable[[Any], None] | None = None,
+    complete: Callable[[Reconstruction], None] | None = None,
     principal_point: bool = True,
     lens_held: bool = False,
     threads: int = -1,
@@ -163,7 +163,7 @@ def place_points(colmap: ModuleType, model: Reconstruction, threads: int = -1) -
     _adjust_points(colmap, model, adjustment)
 
 
-def _adjust_points(colmap: ModuleType, model: Reconstruction, adjustment: Any) -> None:
+def _adjust_points(colmap: ModuleType, model: Reconstruction, adjustment: BundleOptions) -> None:
     """Move points to where the cameras see them."""
     points_alone = deepcopy(adjustment)
     points_alone.refine_rig_from_world = points_alone.refine_principal_point = False
@@ -176,7 +176,7 @@ def _least_gain(model: Reconstruction) -> float:
     return min(_LEAST_GAIN / int(model.compute_num_observations()), _LEAST_GAIN_OF_FEW)
 
 
-def _adjust(colmap: ModuleType, model: Reconstruction, adjustment: Any) -> None:
+def _adjust(colmap: ModuleType, model: Reconstruction, adjustment: BundleOptions) -> None:
     bundle = colmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         bundle.add_image(image_id)
@@ -190,7 +190,7 @@ def _adjust(colmap: ModuleType, model: Reconstruction, adjustment: Any) -> None:
         )
 
 
-def hold_lenses_in_place(bundle: Any, model: Reconstruction) -> None:
+def hold_lenses_in_place(bundle: BundleConfig, model: Reconstruction) -> None:
     """Hold the lenses of rigs that are exactly at the place of the reference lens, in an adjustment (`rigs.py`)."""
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
@@ -198,7 +198,7 @@ def hold_lenses_in_place(bundle: Any, model: Reconstruction) -> None:
                 bundle.set_constant_sensor_from_rig_pose(sensor)
 
 
-def _free_principal_point(colmap: ModuleType, model: Reconstruction, adjustment: Any) -> bool:
+def _free_principal_point(colmap: ModuleType, model: Reconstruction, adjustment: BundleOptions) -> bool:
     """Adjust with the principal point free, and return whether the result was accepted.
 
     A refused principal point is frozen where it was, and all other parameters are adjusted anew.
@@ -226,7 +226,12 @@ def _free_principal_point(colmap: ModuleType, model: Reconstruction, adjustment:
 
 
 def _adjust_robustly(
-    colmap: ModuleType, model: Reconstruction, adjustment: Any, task: ProgressTask, *, settled: bool = False
+    colmap: ModuleType,
+    model: Reconstruction,
+    adjustment: BundleOptions,
+    task: ProgressTask,
+    *,
+    settled: bool = False,
 ) -> None:
     """Adjust until the scale of the kernel is that of the adjustment before; once, if the cameras are settled."""
     adjustment.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
@@ -264,7 +269,7 @@ _MOST_ITERATIONS = 50
 def position_adjuster(
     colmap: ModuleType,
     model: Reconstruction,
-    positions: Sequence[tuple[Any, ArrayLike, ArrayLike]],
+    positions: Sequence[tuple[ColmapImage, ArrayLike, ArrayLike]],
     *,
     iterations: int,
     gate_m: float,

@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -29,7 +29,7 @@ from pipelines.core.products import Product, load_json
 from pipelines.core.progress import Progress
 from pipelines.core.sentences import listed
 from pipelines.core.stages import BY_NAME, SURVEY
-from pipelines.core.types import IntArray
+from pipelines.core.types import IntArray, JsonValue
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.formats.colmap import quiet_colmap
 from pipelines.jobs.engine import Job, JobEnd
@@ -149,7 +149,7 @@ def work_chunk(workspace: Workspace, name: str, progress: Progress) -> bool:
     return True
 
 
-def write_chunk(arguments: Mapping[str, Any], progress: Progress) -> None:
+def write_chunk(arguments: Mapping[str, JsonValue], progress: Progress) -> None:
     """Compute the features or matches of a chunk, in a child process; paths and name are among the arguments."""
     partial = Path(arguments["partial"])
     plan = load_json(ChunkPlan, partial / PLAN)

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping
 from contextlib import closing
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from pipelines.core.errors import DamagedPartialError, InputError, storage_error
 from pipelines.core.files import remove, replace_file
 from pipelines.core.stages import SURVEY
 from pipelines.core.types import FloatArray, IntArray
-from pipelines.geometry.cameras import ColmapDatabase
+from pipelines.geometry.cameras import ColmapCamera, ColmapDatabase
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import CameraPrior, Survey
 
@@ -227,7 +226,7 @@ def _write_camera(colmap: ModuleType, database: ColmapDatabase, prior: CameraPri
     database.write_rig(rig, use_rig_id=True)
 
 
-def _copy_shared_params(colmap: ModuleType, prior: CameraPrior, camera: Any) -> None:
+def _copy_shared_params(colmap: ModuleType, prior: CameraPrior, camera: ColmapCamera) -> None:
     try:
         original = colmap.Camera(
             model=prior.model, width=prior.width, height=prior.height, params=list(prior.params)

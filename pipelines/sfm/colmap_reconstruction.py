@@ -139,6 +139,11 @@ def map_matches(colmap: ModuleType, job: SfmJob, progress: Progress) -> tuple[An
     return model, lens_held
 
 
-def _adjust(colmap: ModuleType, job: SfmJob, model: Reconstruction, **how: Any) -> None:
+def _adjust(
+    colmap: ModuleType,
+    job: SfmJob,
+    model: Reconstruction,
+    **how: Any,  # of `adjust_finally`
+) -> None:
     free, threads = job.options.principal_point, chosen_threads(job.options.threads)
     adjust_finally(colmap, model, principal_point=free, threads=threads, **how)

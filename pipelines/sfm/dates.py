@@ -35,7 +35,7 @@ from pipelines.core.types import BoolArray, FloatArray, IntArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import flatten, load_reconstruction
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_enu_rotation, lla_of
-from pipelines.geometry.cameras import ColmapDatabase, Reconstruction
+from pipelines.geometry.cameras import ColmapDatabase, ColmapImage, Reconstruction
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.sfm.colmap_database import FEATURES, add_features, copy_rows, drop_added_features, remove_database
@@ -450,7 +450,7 @@ class _BothDates:
         return self.known[number]
 
 
-def _points_of(image: Any) -> IntArray:
+def _points_of(image: ColmapImage) -> IntArray:
     """Return the points (K,) of the features of an image of a `pycolmap.Reconstruction`; −1: none."""
     return np.array([point.point3D_id if point.has_point3D() else -1 for point in image.points2D], dtype=np.int64)
 
@@ -510,7 +510,9 @@ def _added_features(colmap: ModuleType, path: Path) -> dict[int, FloatArray]:
     return found
 
 
-def _write_images(colmap: ModuleType, database: Any, model: Any, first: int, cameras: int) -> None:
+def _write_images(
+    colmap: ModuleType, database: ColmapDatabase, model: Reconstruction, first: int, cameras: int
+) -> None:
     """Write the solved cameras and the registered images of a model, their ids moved, into a database."""
     for camera in model.cameras.values():
         moved = colmap.Camera(

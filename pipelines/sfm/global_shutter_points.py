@@ -26,7 +26,7 @@ _LEAST_PX = 0.05  # largest motion of a row in the image that is worth a correct
 
 
 def correct_tie_points(
-    model: Reconstruction, survey: Survey, adjust: Callable[[Any], None]
+    model: Reconstruction, survey: Survey, adjust: Callable[[Reconstruction], None]
 ) -> tuple[Any, RollingShutter | None]:
     """Return a `pycolmap.Reconstruction` with corrected observations, adjusted, and the motion of its cameras.
 

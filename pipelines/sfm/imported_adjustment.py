@@ -35,7 +35,7 @@ def settle_imported(
     model: Reconstruction,
     rule: Rule,
     *,
-    again: Callable[[Any], Any] | None = None,
+    again: Callable[[Reconstruction], Reconstruction] | None = None,
     principal_point: bool = True,
     threads: int = -1,
     progress: Progress,
@@ -86,7 +86,11 @@ def settle_imported(
 
 
 def _in_rounds(
-    colmap: ModuleType, model: Reconstruction, again: Callable[[Any], Any], threads: int, progress: Progress
+    colmap: ModuleType,
+    model: Reconstruction,
+    again: Callable[[Reconstruction], Reconstruction],
+    threads: int,
+    progress: Progress,
 ) -> Any:
     """Return the model triangulated and adjusted by turns, until the number of its observations settles."""
     observations = 0
@@ -122,7 +126,7 @@ def _redundant(model: Reconstruction) -> bool:
     return bool(model.num_points3D() > 0 and 2 * model.compute_num_observations() > unknowns)
 
 
-def _gain(before: Any, after: Any, parameters: int) -> tuple[float, float, float]:
+def _gain(before: Reconstruction, after: Reconstruction, parameters: int) -> tuple[float, float, float]:
     """Return by how much χ² is lower after than before, for each parameter, and σ (px) before and after."""
     first, second = residual_px(before), residual_px(after)
     sigma = max(rayleigh_sigma(second), LEAST_SCALE_PX)

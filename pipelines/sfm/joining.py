@@ -67,7 +67,7 @@ def join_by_matches(
 
 
 def _join_some(
-    colmap: ModuleType, job: SfmJob, whole: Reconstruction, parts: list[Any], task: ProgressTask
+    colmap: ModuleType, job: SfmJob, whole: Reconstruction, parts: list[Reconstruction], task: ProgressTask
 ) -> tuple[Any, list[Join]]:
     """Return the model with those parts that are tied to it as it is now, and their joins."""
     joins = []

@@ -174,7 +174,7 @@ def add_learned(colmap: ModuleType, job: SfmJob, pairs: IntArray, progress: Prog
     return len(matches)
 
 
-def _load(torch: Any, network: Any, path: Path, names: dict[str, str]) -> None:
+def _load(torch: ModuleType, network: torch.nn.Module, path: Path, names: dict[str, str]) -> None:
     """Load weights, data alone, into a network; parts of the weights' names are replaced."""
     state = {}
     for key, value in torch.load(path, map_location="cpu", weights_only=True).items():

@@ -9,9 +9,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
+from numpy.typing import ArrayLike
+
 from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress
-from pipelines.geometry.cameras import ColmapDatabase, Reconstruction
+from pipelines.geometry.cameras import ColmapCamera, ColmapDatabase, Reconstruction
 from pipelines.sfm.features import SfmJob
 from pipelines.sfm.options import SfmOptions
 
@@ -120,7 +122,7 @@ def _models(
 
 
 @contextmanager
-def replaced_lens(colmap: ModuleType, path: Path, params: Mapping[int, Any]) -> Iterator[None]:
+def replaced_lens(colmap: ModuleType, path: Path, params: Mapping[int, ArrayLike]) -> Iterator[None]:
     """Give cameras in a database other parameters for a while."""
     with colmap.Database.open(path) as database:
         stated = {camera.camera_id: camera for camera in database.read_all_cameras() if camera.camera_id in params}
@@ -133,7 +135,9 @@ def replaced_lens(colmap: ModuleType, path: Path, params: Mapping[int, Any]) -> 
             _write_params(database, stated, before)
 
 
-def _write_params(database: ColmapDatabase, cameras: Mapping[int, Any], params: Mapping[int, Any]) -> None:
+def _write_params(
+    database: ColmapDatabase, cameras: Mapping[int, ColmapCamera], params: Mapping[int, ArrayLike]
+) -> None:
     for camera_id, camera in cameras.items():
         camera.params = params[camera_id]
         database.update_camera(camera)
@@ -164,7 +168,7 @@ def triangulate(
     mapper.end_reconstruction(False)
 
 
-def _registered(models: list[Any]) -> int:
+def _registered(models: list[Reconstruction]) -> int:
     return models[0].num_reg_images() if models else 0
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.core.types import FloatArray
-from pipelines.geometry.cameras import Reconstruction
+from pipelines.geometry.cameras import ColmapImage, Reconstruction
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.sfm.adjustment import alignment_with
@@ -33,7 +33,9 @@ class ModelPart:
     apart: str  # empty: it was joined
 
 
-def join_parts(colmap: ModuleType, models: list[Any], survey: Survey) -> tuple[Any, tuple[ModelPart, ...]]:
+def join_parts(
+    colmap: ModuleType, models: list[Reconstruction], survey: Survey
+) -> tuple[Any, tuple[ModelPart, ...]]:
     """Return the largest of some `pycolmap.Reconstruction`s, to which the others were added, and what these are.
 
     The models are sorted, the largest first. COLMAP lets two of them share a few photographs: the first one keeps
@@ -88,7 +90,7 @@ def placed_by_positions(model: Reconstruction, measured: dict[str, SurveyImage])
     return place
 
 
-def _mean_rotation(images: list[Any], measured: dict[str, SurveyImage]) -> FloatArray | None:
+def _mean_rotation(images: list[ColmapImage], measured: dict[str, SurveyImage]) -> FloatArray | None:
     """Return the rotation geo ← local by the attitudes; None: too few, or they do not agree."""
     turns = []
     for image in images:

@@ -22,7 +22,7 @@ from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
 from pipelines.core.products import save_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import ADJUSTMENT, SIM3_POSTERIOR, SPARSE
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, JsonValue
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import load_reconstruction, quiet_colmap, read_sparse, write_reconstruction
 from pipelines.geometry.cameras import Reconstruction, pycolmap_module
@@ -55,7 +55,7 @@ def run(stage: StageRun, options: AdjustOptions) -> Summary:
     return Summary(document["key_figure"], document["values"])
 
 
-def write_adjusted(arguments: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
+def write_adjusted(arguments: Mapping[str, JsonValue], progress: Progress) -> dict[str, Any]:
     """Adjust a model and write it; return the summary as a document.
 
     Among the arguments are the calibrated `survey`, paths of `model` and `out`, and `seed`.

@@ -24,7 +24,7 @@ from pipelines.core.machine import chosen_threads
 from pipelines.core.progress import Progress
 from pipelines.core.types import FloatArray
 from pipelines.formats.colmap import flatten, reconstruction_of
-from pipelines.geometry.cameras import ColmapDatabase, Reconstruction
+from pipelines.geometry.cameras import ColmapCamera, ColmapDatabase, Reconstruction
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.statistics import CAUCHY_95
 from pipelines.sfm.adjustment import alignment_with, hold_lenses_in_place
@@ -178,7 +178,7 @@ def _rebuilt(colmap: ModuleType, job: SfmJob, model: Reconstruction, lenses: Map
 def _add_instant(
     colmap: ModuleType,
     database: ColmapDatabase,
-    new: Any,
+    new: Reconstruction,
     *,
     model: Reconstruction,
     frame_id: int,
@@ -230,7 +230,7 @@ def _instants(survey: Survey, lenses: Mapping[int, _Lens]) -> dict[int, dict[int
     return instants
 
 
-def _rigs(colmap: ModuleType, cameras: Any, lenses: Mapping[int, _Lens]) -> list[Any]:
+def _rigs(colmap: ModuleType, cameras: Mapping[int, ColmapCamera], lenses: Mapping[int, _Lens]) -> list[Any]:
     """Return the rigs of all cameras, with the numbers of their reference cameras; most consist of one camera."""
     rigs = {}
     for key, camera in cameras.items():

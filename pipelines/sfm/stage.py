@@ -17,6 +17,7 @@ from pipelines.core.plan import photograph_folder
 from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import COMMON_POINTS, RIG_MODEL, SURVEY
+from pipelines.core.types import JsonValue
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import load_reconstruction, quiet_colmap
 from pipelines.geometry.cameras import Reconstruction
@@ -67,7 +68,7 @@ def run(stage: StageRun, options: SfmOptions) -> Summary:
     return Summary(document["key_figure"], document["values"], warnings)
 
 
-def write_model(arguments: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
+def write_model(arguments: Mapping[str, JsonValue], progress: Progress) -> dict[str, Any]:
     """Reconstruct or import the model and write it; return the summary as a document.
 
     Among the arguments are paths of `survey`, `images` and `out`, and the `options` of the stage.
@@ -102,7 +103,7 @@ def surveyed(path: Path, options: SfmOptions) -> Survey:
     return survey if options.import_model is not None else survey.with_companions()
 
 
-def _summarise_rig(reference: Any, model: Reconstruction, survey: Survey) -> Summary:
+def _summarise_rig(reference: Reconstruction, model: Reconstruction, survey: Survey) -> Summary:
     """Return the summary of the reference lens's photographs, with the number of all."""
     images = tuple(image for image in survey.images if image.name not in {each.name for each in survey.companions})
     summary = _summarise(reference, survey.model_copy(update={"images": images}))

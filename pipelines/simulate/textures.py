@@ -6,11 +6,10 @@ width of the pixel on the surface, and filters itself: a box filter for stripes,
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pipelines.core.types import ByteArray, Float32Array, rows_of
 from pipelines.formats.fiducials import tag_modules
@@ -103,7 +102,7 @@ def stripes(x: Float32Array, period: ArrayLike, width: ArrayLike, pixel: Float32
     every, wide = np.asarray(period, dtype=np.float32), np.asarray(width, dtype=np.float32)
     reach = np.maximum(pixel, np.float32(1e-4)).astype(np.float32)
 
-    def covered(end: NDArray[np.floating[Any]]) -> Float32Array:
+    def covered(end: Float32Array) -> Float32Array:
         whole = np.floor(end / every)
         return np.asarray(whole * wide + np.minimum(end - whole * every, wide))
 

@@ -159,6 +159,9 @@ class FrozenExposures:
         """Accept the state of `state`, which is empty."""
 
 
+_Values = Any  # a number, an array or a tensor
+
+
 def with_affine(colour: Tensor, affine: Tensor) -> Tensor:
     """Return A c + b of every colour c in (…, 3), for (A | b) in `affine` (3, 4)."""
     return colour @ affine[:, :3].T + affine[:, 3]
@@ -173,7 +176,7 @@ def with_vignetting(colour: Tensor, radius2: Tensor, coefficients: Tensor) -> Te
     return shown
 
 
-def falloff(radius2: Any, coefficients: Sequence[Any]) -> Any:
+def falloff(radius2: _Values, coefficients: Sequence[_Values]) -> Any:
     """Return the vignetting 1 + r²(v₀ + r²(v₁ + …)) of squared radii, a tensor or an array, by its terms."""
     factor = 0.0 * radius2
     for coefficient in reversed(coefficients):
@@ -194,10 +197,10 @@ def squared_radius(camera: Pinhole, whole: Pinhole, device: torch.device) -> Ten
     return radius2.float()
 
 
-def squared_radius_at(x: Any, y: Any, camera: Pinhole, whole: Pinhole) -> Any:
+def squared_radius_at(x: _Values, y: _Values, camera: Pinhole, whole: Pinhole) -> Any:
     """Return the squared distance of pixels x, y of a camera from the optical axis, as `squared_radius`."""
 
-    def squared(of: Pinhole, x: Any, y: Any) -> Any:
+    def squared(of: Pinhole, x: _Values, y: _Values) -> Any:
         return ((x - of.cx) / of.fx) ** 2 + ((y - of.cy) / of.fy) ** 2
 
     furthest = max(squared(whole, x, y) for x in (0.0, whole.width) for y in (0.0, whole.height))

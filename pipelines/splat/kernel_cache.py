@@ -21,7 +21,10 @@ from typing import Any
 import llvmlite.binding as llvm
 import numba
 from numba import njit
+from numba.core.base import BaseContext as TargetContext
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.compiler import CompileResult
+from numba.core.typing.templates import Signature
 
 from pipelines.core.machine import user_cache
 
@@ -32,11 +35,15 @@ _IMPORTS = re.compile(r"^ *from (pipelines[\w.]*) import (\([^)]*\)|[^\n]*)", re
 _MOST_FOLDERS = 60  # one a kernel's module and version of its sources
 
 
-def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+_Kernel = Callable[..., Any]  # that numba compiles
+_NumbaOption = Any  # of its `njit`
+
+
+def kernel(**options: _NumbaOption) -> Callable[[_Kernel], Any]:
     """Return numba's `njit` with options, for functions that Python calls: compiled once for this user."""
 
-    def compiled(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(**options)(function)
+    def compiled(function: _Kernel) -> Any:
+        dispatcher: Any = njit(**options)(function)
         dispatcher._cache = _UserCache(function)
         return dispatcher
 
@@ -75,12 +82,12 @@ def _digest(module: Path) -> str:
 class _Locator:
     """Place of a kernel's compiled forms, as numba asks for it."""
 
-    def __init__(self, function: Callable[..., Any], module: Path) -> None:
+    def __init__(self, function: _Kernel, module: Path) -> None:
         self._folder = cache_folder() / _digest(module)
         self._line = function.__code__.co_firstlineno
 
     @classmethod
-    def from_function(cls, function: Callable[..., Any], file: str) -> _Locator:
+    def from_function(cls, function: _Kernel, file: str) -> _Locator:
         return cls(function, Path(file))
 
     def ensure_cache_path(self) -> None:
@@ -110,7 +117,7 @@ class _UserCache(FunctionCache):
 
     _impl_class = _Compiled
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def load_overload(self, sig: Signature, target_context: TargetContext) -> Any:
         folder = Path(self.cache_path)
         try:
             if not folder.is_dir() or not _is_own(folder):
@@ -121,7 +128,7 @@ class _UserCache(FunctionCache):
             log.debug("compiled kernels in %s cannot be read: %s", folder, error)
             return None
 
-    def save_overload(self, sig: Any, data: Any) -> None:
+    def save_overload(self, sig: Signature, data: CompileResult) -> None:
         try:
             self._impl.locator.ensure_cache_path()
             if _is_own(Path(self.cache_path)):

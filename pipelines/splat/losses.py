@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import AutogradContext, BoolArray, FloatArray, IntArray
 from pipelines.splat import ssim_kernels as kernels
 from pipelines.splat.gaussians import Gaussians
 
@@ -68,7 +68,9 @@ def image_similarity(image: Tensor, target: Tensor, mask: Tensor | None = None) 
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float) -> Tensor:
+    def forward(
+        ctx: AutogradContext, rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float
+    ) -> Tensor:
         wanted = ssim_weight if ctx.needs_input_grad[0] else None
         absolute, similarity, count, gradient = _by_kernels(rendered, target, mask, wanted)
         if gradient is not None:
@@ -77,7 +79,7 @@ class _Photometric(torch.autograd.Function):
         return rendered.new_tensor(loss)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: AutogradContext, *grad_outputs: Tensor) -> tuple[Tensor, None, None, None]:
         (gradient,) = ctx.saved_tensors
         return gradient * grad_outputs[0], None, None, None
 
@@ -128,12 +130,12 @@ class _Blur(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, planes: Tensor, taps: Tensor) -> Tensor:
+    def forward(ctx: AutogradContext, planes: Tensor, taps: Tensor) -> Tensor:
         ctx.save_for_backward(taps)
         return _blurred(planes, taps)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: AutogradContext, *grad_outputs: Tensor) -> tuple[Tensor, None]:
         (taps,) = ctx.saved_tensors
         return _blurred(grad_outputs[0], taps), None
 
@@ -257,7 +259,10 @@ class PlaneAttraction:
         return (weight * torch.log1p(off.square())).sum() / max(len(visible), 1)
 
 
-def _keys(cell: Any) -> Any:
+_Cells = Any  # array or tensor
+
+
+def _keys(cell: _Cells) -> Any:
     """Return the keys of cells (N, 3), an array or a tensor; the key of a sum of cells is the sum of their keys."""
     return (cell[:, 0] << 2 * _SIDE_BITS) + (cell[:, 1] << _SIDE_BITS) + cell[:, 2]
 

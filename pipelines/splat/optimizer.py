@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from numba import prange
+from numpy.typing import NDArray
 from torch import Tensor
 
+from pipelines.core.types import Float32Array, IntArray
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.kernel_cache import kernel
 
@@ -29,17 +30,17 @@ from pipelines.splat.kernel_cache import kernel
 
 @kernel(parallel=True, fastmath={"contract", "nsz"})
 def adam_rows(
-    rows: Any,
-    places: Any,
-    parameters: Any,
-    gradients: Any,
-    exp_avg: Any,
-    exp_avg_sq: Any,
-    steps: Any,
-    rates: Any,
-    corrections: Any,
-    betas: Any,
-    eps: Any,
+    rows: IntArray,  # (V,) int64
+    places: IntArray,  # (V,) int64
+    parameters: tuple[Float32Array, ...],  # (N, Dᵢ) float32
+    gradients: tuple[Float32Array, ...],  # (M, Dᵢ) float32
+    exp_avg: Float32Array,  # (N, D) float32
+    exp_avg_sq: Float32Array,  # (N, D) float32
+    steps: NDArray[np.int32],  # (N,) int32
+    rates: Float32Array,  # (D,) float32
+    corrections: Float32Array,  # (T, 2) float32
+    betas: Float32Array,  # (4,) float32
+    eps: np.float32,
 ) -> None:
     """Take one step of Adam (doi 10.48550/arXiv.1412.6980, alg. 1) on some rows, in place.
 

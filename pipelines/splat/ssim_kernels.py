@@ -9,12 +9,11 @@ Numbers are float32 or float64, like the images; sums over pixels are float64.
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
-from typing import Any
-
 import numpy as np
 from numba import njit, prange
+from numpy.typing import DTypeLike
 
-from pipelines.core.types import ArrayHW, ArrayN, ArrayNHW, ArrayNK
+from pipelines.core.types import ArrayHW, ArrayN, ArrayNHW, ArrayNK, FloatArray
 from pipelines.splat.kernel_cache import kernel
 
 RADIUS = 5
@@ -27,7 +26,7 @@ PAD = 3 * RADIUS
 _FAST = {"contract", "reassoc", "nsz"}
 
 
-def gaussian_taps(dtype: Any) -> np.ndarray:
+def gaussian_taps(dtype: DTypeLike) -> np.ndarray:
     """Return half of the window's weights (6,), centre first."""
     offset = np.arange(-RADIUS, RADIUS + 1)
     window = np.exp(-(offset**2) / (2 * SIGMA_PX**2))
@@ -35,7 +34,11 @@ def gaussian_taps(dtype: Any) -> np.ndarray:
 
 
 @njit(fastmath=_FAST)
-def _blur_along_row(padded: ArrayN, taps: ArrayN, out: ArrayN) -> None:
+def _blur_along_row(
+    padded: ArrayN,  # (n + 2 PAD,) float32/64
+    taps: ArrayN,  # (RADIUS + 1,) float32/64
+    out: ArrayN,  # (n,) float32/64
+) -> None:
     k0, k1, k2, k3, k4, k5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
     for j in range(out.shape[0]):
         out[j] = (
@@ -49,7 +52,12 @@ def _blur_along_row(padded: ArrayN, taps: ArrayN, out: ArrayN) -> None:
 
 
 @njit(fastmath=_FAST)
-def _blur_across_rows(ring: Any, row: int, taps: ArrayN, out: ArrayN) -> None:
+def _blur_across_rows(
+    ring: ArrayNK,  # (WINDOW, n) float32/64
+    row: int,
+    taps: ArrayN,  # (RADIUS + 1,) float32/64
+    out: ArrayN,  # (n,) float32/64
+) -> None:
     """Blur `row` across rows, from a ring (11, n) in which row r lies at r mod 11."""
     centre = ring[row % WINDOW]
     for j in range(out.shape[0]):
@@ -62,7 +70,12 @@ def _blur_across_rows(ring: Any, row: int, taps: ArrayN, out: ArrayN) -> None:
 
 
 @njit(fastmath=_FAST)
-def _load_masked(image: ArrayHW, valid: ArrayHW, row: int, padded: ArrayN) -> None:
+def _load_masked(
+    image: ArrayHW,  # (H, n) float32/64
+    valid: ArrayHW,  # (H, W) or (0, 0) bool
+    row: int,
+    padded: ArrayN,  # (n + 2 PAD,) float32/64
+) -> None:
     """Load a row between its zero margins; pixels that do not count are zero, like those outside the image."""
     source = image[row]
     for j in range(source.shape[0]):
@@ -76,7 +89,13 @@ def _load_masked(image: ArrayHW, valid: ArrayHW, row: int, padded: ArrayN) -> No
 
 @njit(fastmath=_FAST)
 def _push_moments(
-    rendered: ArrayHW, target: ArrayHW, valid: ArrayHW, row: int, taps: ArrayN, padded: ArrayNK, ring: Any
+    rendered: ArrayHW,  # (H, n) float32/64
+    target: ArrayHW,  # (H, n) float32/64
+    valid: ArrayHW,  # (H, W) or (0, 0) bool
+    row: int,
+    taps: ArrayN,  # (RADIUS + 1,) float32/64
+    padded: ArrayNK,  # (3, n + 2 PAD) float32/64
+    ring: ArrayNHW,  # (5, WINDOW, n) float32/64
 ) -> None:
     """Blur x, y, x², y², xy of a row along the row, into the five rings (5, 11, n)."""
     slot, n = row % WINDOW, rendered.shape[1]
@@ -100,7 +119,13 @@ def _push_moments(
 
 
 @njit(fastmath=_FAST)
-def _ssim_row(moments: Any, c1: Any, c2: Any, partials: ArrayNHW, row: int) -> None:
+def _ssim_row(
+    moments: ArrayNK,  # (5, n) float32/64
+    c1: float,  # of the images' type
+    c2: float,  # of the images' type
+    partials: ArrayNHW,  # (3, H, n) float32/64
+    row: int,
+) -> None:
     """Write SSIM of a row into moments[0], its derivatives by the blurred x, x² and xy into partials (3, H, n)."""
     mu_x, mu_y, xx, yy, xy = moments[0], moments[1], moments[2], moments[3], moments[4]
     one = c1 / c1  # of the images' type: a literal would turn the loop to float64
@@ -120,7 +145,11 @@ def _ssim_row(moments: Any, c1: Any, c2: Any, partials: ArrayNHW, row: int) -> N
 
 
 @njit(fastmath=_FAST)
-def _sum_row(x: ArrayN, y: ArrayN, ssim: ArrayN) -> tuple[float, float]:
+def _sum_row(
+    x: ArrayN,  # (n + 2 PAD,) float32/64
+    y: ArrayN,  # (n + 2 PAD,) float32/64
+    ssim: ArrayN,  # (n,) float32/64
+) -> tuple[float, float]:
     """Return Σ|x − y| and Σ SSIM of a row, in float64."""
     absolute, similarity = 0.0, 0.0
     for j in range(x.shape[0]):
@@ -131,7 +160,12 @@ def _sum_row(x: ArrayN, y: ArrayN, ssim: ArrayN) -> tuple[float, float]:
 
 
 @njit(fastmath=_FAST)
-def _clear_invalid(valid: ArrayHW, row: int, ssim: ArrayN, partials: ArrayNHW) -> None:
+def _clear_invalid(
+    valid: ArrayHW,  # (H, W) or (0, 0) bool
+    row: int,
+    ssim: ArrayN,  # (n,) float32/64
+    partials: ArrayNHW,  # (3, H, n) float32/64
+) -> None:
     for x in range(valid.shape[1]):
         if not valid[row, x]:
             for j in range(3 * x, 3 * x + 3):
@@ -142,15 +176,15 @@ def _clear_invalid(valid: ArrayHW, row: int, ssim: ArrayN, partials: ArrayNHW) -
 
 @kernel(parallel=True, fastmath=_FAST)
 def ssim_forward(
-    rendered: ArrayHW,
-    target: ArrayHW,
-    valid: ArrayHW,
-    taps: ArrayN,
-    c1: Any,
-    c2: Any,
+    rendered: ArrayHW,  # (H, n) float32/64
+    target: ArrayHW,  # (H, n) float32/64
+    valid: ArrayHW,  # (H, W) or (0, 0) bool
+    taps: ArrayN,  # (RADIUS + 1,) float32/64
+    c1: float,  # of the images' type
+    c2: float,  # of the images' type
     bands: int,
-    partials: ArrayNHW,
-    sums: Any,
+    partials: ArrayNHW,  # (3, H, n) float32/64
+    sums: FloatArray,  # (H, 2) float64
 ) -> None:
     """Write Σ|x − y| and Σ SSIM of each row into sums (H, 2), and SSIM's derivatives into partials (3, H, n).
 
@@ -184,7 +218,13 @@ def ssim_forward(
 
 
 @njit(fastmath=_FAST)
-def _push_partials(partials: ArrayNHW, row: int, taps: ArrayN, padded: ArrayN, ring: Any) -> None:
+def _push_partials(
+    partials: ArrayNHW,  # (3, H, n) float32/64
+    row: int,
+    taps: ArrayN,  # (RADIUS + 1,) float32/64
+    padded: ArrayN,  # (n + 2 PAD,) float32/64
+    ring: ArrayNHW,  # (3, WINDOW, n) float32/64
+) -> None:
     slot = row % WINDOW
     if row >= partials.shape[1]:
         ring[:, slot] = 0
@@ -197,7 +237,14 @@ def _push_partials(partials: ArrayNHW, row: int, taps: ArrayN, padded: ArrayN, r
 
 
 @njit(fastmath=_FAST)
-def _gradient_row(x: ArrayN, y: ArrayN, blurred: Any, l1_weight: Any, ssim_weight: Any, out: ArrayN) -> None:
+def _gradient_row(
+    x: ArrayN,  # (n,) float32/64
+    y: ArrayN,  # (n,) float32/64
+    blurred: ArrayNK,  # (3, n) float32/64
+    l1_weight: float,  # of the images' type
+    ssim_weight: float,  # of the images' type
+    out: ArrayN,  # (n,) float32/64
+) -> None:
     by_mu, by_xx, by_xy = blurred[0], blurred[1], blurred[2]
     for j in range(out.shape[0]):
         difference = x[j] - y[j]
@@ -208,15 +255,15 @@ def _gradient_row(x: ArrayN, y: ArrayN, blurred: Any, l1_weight: Any, ssim_weigh
 
 @kernel(parallel=True, fastmath=_FAST)
 def ssim_backward(
-    rendered: ArrayHW,
-    target: ArrayHW,
-    valid: ArrayHW,
-    partials: ArrayNHW,
-    taps: ArrayN,
-    l1_weight: Any,
-    ssim_weight: Any,
+    rendered: ArrayHW,  # (H, n) float32/64
+    target: ArrayHW,  # (H, n) float32/64
+    valid: ArrayHW,  # (H, W) or (0, 0) bool
+    partials: ArrayNHW,  # (3, H, n) float32/64
+    taps: ArrayN,  # (RADIUS + 1,) float32/64
+    l1_weight: float,  # of the images' type
+    ssim_weight: float,  # of the images' type
     bands: int,
-    gradient: ArrayHW,
+    gradient: ArrayHW,  # (H, n) float32/64
 ) -> None:
     """Write ∂(l1_weight · Σ|x − y| − ssim_weight · Σ SSIM)/∂x into gradient (H, n).
 

@@ -7,12 +7,12 @@ the roof where the roof is, and the ground where the ground is. A sweep of plane
 
 import itertools
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from pipelines.core.types import Float32Array
+from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.geometry.cameras import ViewPose
 from pipelines.splat.kernel_cache import kernel
 from pipelines.surface.matching import UNSEEN, Matcher, MatchSettings, StereoView, WinnerTakesAll, camera_matrix
@@ -33,16 +33,16 @@ THRESHOLDS = (LEAST_SCORE, SAME_STEPS, LEAST_VIEWS, FREE, MOST_THROUGH, _RIM)
 
 @kernel(nogil=True, error_model="numpy")
 def compare_depths(
-    depth: Any,
-    ray_from_pixel: Any,
-    center: Any,
-    other_center: Any,
-    pixel_from_model: Any,
-    other: Any,
-    other_index: Any,
-    other_normals: Any,
-    sums: Any,
-    counts: Any,
+    depth: FloatArray,  # (H, W) float64
+    ray_from_pixel: FloatArray,  # (3, 3) float64
+    center: FloatArray,  # (3,) float64
+    other_center: FloatArray,  # (3,) float64
+    pixel_from_model: FloatArray,  # (3, 3) float64
+    other: Float32Array,  # (4, h, w) float32
+    other_index: ByteArray,  # (h, w) uint8
+    other_normals: FloatArray,  # (F, 3) float64
+    sums: FloatArray,  # (2, H, W) float64
+    counts: NDArray[np.int32],  # (2, H, W) int32
 ) -> None:
     """Compare the points of a view with the surface of one other view, without the GIL, and add up what it says.
 

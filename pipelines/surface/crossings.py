@@ -11,12 +11,11 @@ Discs extend over silhouettes by their radius: a point close behind an edge coun
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.core.types import ArrayN, ArrayN3, FloatArray, IntArray
+from pipelines.core.types import ArrayN, ArrayN3, ByteArray, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.kernel_cache import kernel
 
@@ -63,15 +62,15 @@ def seen_surfels(surfels: Surfels, cam_from_world: FloatArray, center: FloatArra
 
 @kernel(nogil=True, error_model="numpy")
 def _draw(
-    points: ArrayN3,
-    normals: ArrayN3,
-    radii: ArrayN,
-    intrinsics: ArrayN,
+    points: ArrayN3,  # (P, 3) float64
+    normals: ArrayN3,  # (P, 3) float64
+    radii: ArrayN,  # (P,) float64
+    intrinsics: ArrayN,  # (4,) float64
     width: int,
     height: int,
-    nearest: ArrayN,
-    pixel: ArrayN,
-    depth_at_pixel: ArrayN,
+    nearest: ArrayN,  # (height · width,) float64
+    pixel: ArrayN,  # (P,) int64
+    depth_at_pixel: ArrayN,  # (P,) float64
 ) -> None:
     """Draw discs in camera coordinates into a depth buffer.
 
@@ -124,7 +123,13 @@ def count_beams(
 
 
 @kernel(nogil=True, error_model="numpy")
-def _cross(end: ArrayN3, start: ArrayN3, low: Any, cell_m: float, count: Any) -> None:
+def _cross(
+    end: ArrayN3,  # (P, 3) float64
+    start: ArrayN3,  # (P, 3) float64
+    low: ArrayN,  # (3,) float64
+    cell_m: float,
+    count: ByteArray,  # (X, Y, Z) uint8
+) -> None:
     for p in range(len(end)):
         dx, dy, dz = start[p, 0] - end[p, 0], start[p, 1] - end[p, 1], start[p, 2] - end[p, 2]
         length = np.sqrt(dx * dx + dy * dy + dz * dz)

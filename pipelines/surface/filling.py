@@ -125,7 +125,10 @@ def _scatter(height: FloatArray) -> FloatArray:
 
 @kernel(nogil=True, parallel=True, error_model="numpy")
 def _looked(
-    height: FloatArray, cells: IntArray, directions: FloatArray, reach: int
+    height: FloatArray,  # (H, W) float64
+    cells: IntArray,  # (C, 2) int64
+    directions: FloatArray,  # (D, 2) float64
+    reach: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
     """Return low quantile, mean square difference from it, distance, missing share of directions, source."""
     count = len(cells)

@@ -71,7 +71,12 @@ def chosen_pixels(
 
 @njit(nogil=True, error_model="numpy")
 def _surface_at(
-    depth: ArrayHW, row: int, column: int, lens: Any, turn: Array33, center: ArrayN
+    depth: ArrayHW,  # (H, W) float32
+    row: int,
+    column: int,
+    lens: ArrayN,  # (4,) float64
+    turn: Array33,  # (3, 3) float64
+    center: ArrayN,  # (3,) float64
 ) -> tuple[float, float, float]:
     """Return the place of a pixel's surface."""
     z = np.float64(depth[row, column])
@@ -85,7 +90,13 @@ def _surface_at(
 
 @njit(nogil=True, error_model="numpy")
 def _window(
-    depth: ArrayHW, lens: Any, turn: Array33, center: ArrayN, box: Any, reach: int, look: int
+    depth: ArrayHW,  # (H, W) float32
+    lens: ArrayN,  # (4,) float64
+    turn: Array33,  # (3, 3) float64
+    center: ArrayN,  # (3,) float64
+    box: ArrayN,  # (4,) float64
+    reach: int,
+    look: int,
 ) -> tuple[int, int, int, int]:
     """Return the rows and columns that show a box; parts narrower than `look` may be missed."""
     height, width = depth.shape
@@ -111,14 +122,14 @@ def _window(
 
 @kernel(nogil=True, error_model="numpy")
 def _chosen(
-    depth: ArrayHW,
-    rgb: ArrayHWC,
-    lens: Any,
-    turn: Array33,
-    center: ArrayN,
+    depth: ArrayHW,  # (H, W) float32
+    rgb: ArrayHWC,  # (H, W, 3) uint8
+    lens: ArrayN,  # (4,) float64
+    turn: Array33,  # (3, 3) float64
+    center: ArrayN,  # (3,) float64
     scale: float,
-    box: Any,
-    window: Any,
+    box: ArrayN,  # (4,) float64
+    window: tuple[int, int, int],  # reach, step, look, px
     most_bend: float,
     grazing: float,
     coarsest_m: float,
@@ -193,7 +204,10 @@ def _keys(position: FloatArray, side_m: float) -> IntArray:
 
 
 @kernel(nogil=True, error_model="numpy")
-def _extent(position: ArrayN3, side_m: float) -> Any:
+def _extent(
+    position: ArrayN3,  # (P, 3) float64
+    side_m: float,
+) -> Any:
     """Return the least voxel (3,) of points, and how many there are (3,) along each axis."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for row in range(len(position)):
@@ -204,7 +218,12 @@ def _extent(position: ArrayN3, side_m: float) -> Any:
 
 
 @kernel(nogil=True, error_model="numpy")
-def _numbered(position: ArrayN3, side_m: float, low: ArrayN, extent: ArrayN) -> Any:
+def _numbered(
+    position: ArrayN3,  # (P, 3) float64
+    side_m: float,
+    low: ArrayN,  # (3,) float64
+    extent: ArrayN,  # (3,) int64
+) -> Any:
     key = np.empty(len(position), np.int64)
     for row in range(len(position)):
         number = 0
@@ -224,7 +243,9 @@ def _members(key: IntArray) -> tuple[IntArray, IntArray]:
 
 
 @kernel(nogil=True, error_model="numpy")
-def _hashed(key: Any) -> Any:
+def _hashed(
+    key: IntArray,  # (P,) int64
+) -> Any:
     """Return the number (P,) of each key among the different ones, in the order of their first, these, and counts.
 
     An open hash table is twice as fast as sorting: a voxel has dozens of points.
@@ -252,7 +273,12 @@ def _hashed(key: Any) -> Any:
 
 
 @njit(nogil=True, error_model="numpy")
-def _slot(table: Any, own: Any, key: int, bits: int) -> Any:
+def _slot(
+    table: IntArray,  # (T,) int64
+    own: IntArray,  # (K,) int64
+    key: int,
+    bits: int,
+) -> Any:
     """Return the place of a key in the table, or the free one that it takes."""
     mask = len(table) - 1
     slot = np.int64(np.uint64(key * _HASH) >> np.uint64(64 - bits))
@@ -262,7 +288,11 @@ def _slot(table: Any, own: Any, key: int, bits: int) -> Any:
 
 
 @kernel(nogil=True, error_model="numpy")
-def _add_rows(voxel: ArrayN, values: ArrayNK, sums: ArrayNK) -> None:
+def _add_rows(
+    voxel: ArrayN,  # (P,) int64
+    values: ArrayNK,  # (P, K) of any type
+    sums: ArrayNK,  # (V, K) float64
+) -> None:
     """Add values (P, K) to the sums (V, K) of their voxels."""
     for row in range(len(values)):
         for k in range(values.shape[1]):

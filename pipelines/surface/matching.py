@@ -15,13 +15,13 @@ therefore keep out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from pipelines.core.types import BoolArray, Float32Array, FloatArray
+from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.splat.kernel_cache import kernel
 
@@ -42,7 +42,15 @@ def _reflected(row: int, height: int) -> int:
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
 def _project_row(
-    depth: Any, row: int, per_depth: Any, start: Any, size: Any, stride: int, place: Any, fraction: Any, miss: Any
+    depth: Float32Array,  # (W,) float32
+    row: int,
+    per_depth: Float32Array,  # (3, 3) float32
+    start: Float32Array,  # (3,) float32
+    size: Float32Array,  # (2,) float32
+    stride: int,
+    place: NDArray[np.int32],  # (W,) int32
+    fraction: Float32Array,  # (2, W) float32
+    miss: Float32Array,  # (W,) float32
 ) -> None:
     """Project the pixels of a row at their depths (W,) into a neighbour, clamped to its image.
 
@@ -71,7 +79,14 @@ def _project_row(
 
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
-def _sample_row(grey: Any, stride: int, place: Any, fraction: Any, miss: Any, shown: Any) -> None:
+def _sample_row(
+    grey: Float32Array,  # (h · w,) float32
+    stride: int,
+    place: NDArray[np.int32],  # (W,) int32
+    fraction: Float32Array,  # (2, W) float32
+    miss: Float32Array,  # (W,) float32
+    shown: Float32Array,  # (W,) float32
+) -> None:
     """Write the interpolated grey levels at places into `shown` (W,); 0 where the place was missed."""
     down = np.uint32(stride)
     for i in range(place.shape[0]):
@@ -84,7 +99,12 @@ def _sample_row(grey: Any, stride: int, place: Any, fraction: Any, miss: Any, sh
 
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
-def _add_across(reference: Any, padded: Any, half: int, sums: Any) -> None:
+def _add_across(
+    reference: Float32Array,  # (W + 2 half,) float32
+    padded: Float32Array,  # (W + 2 half,) float32
+    half: int,
+    sums: Float32Array,  # (3, W) float32
+) -> None:
     """Write Σ other, Σ other², Σ reference · other over windows along a row into sums (3, W).
 
     Both rows (W + 2 half,) are mirrored at their ends; `padded` is that of the neighbour, as the reference sees it.
@@ -103,7 +123,10 @@ def _add_across(reference: Any, padded: Any, half: int, sums: Any) -> None:
 
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
-def _mirror_ends(padded: Any, half: int) -> None:
+def _mirror_ends(
+    padded: Float32Array,  # (W + 2 half,) float32
+    half: int,
+) -> None:
     width = padded.shape[0] - 2 * half
     for k in range(half):
         padded[half - 1 - k] = padded[half + k]
@@ -111,7 +134,14 @@ def _mirror_ends(padded: Any, half: int) -> None:
 
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
-def _correlate_row(ring: Any, shown: Any, mean: Any, inverse_sigma: Any, total: Any, score: Any) -> None:
+def _correlate_row(
+    ring: Float32Array,  # (window, 3, W) float32
+    shown: Float32Array,  # (W,) float32
+    mean: Float32Array,  # (W,) float32
+    inverse_sigma: Float32Array,  # (W,) float32
+    total: Float32Array,  # (3, W) float32
+    score: Float32Array,  # (W,) float32
+) -> None:
     """Write the correlation of a row with a neighbour into score (W,).
 
     The ring (window, 3, W) has sums along the rows of the window, `shown` (W,) the neighbour's grey levels at the
@@ -133,7 +163,10 @@ def _correlate_row(ring: Any, shown: Any, mean: Any, inverse_sigma: Any, total: 
 
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
-def _keep_largest(score: Any, largest: Any) -> None:
+def _keep_largest(
+    score: Float32Array,  # (W,) float32
+    largest: Float32Array,  # (k, W) float32
+) -> None:
     """Insert scores (W,) into the sorted largest (k, W) so far; overwrites them."""
     for rank in range(largest.shape[0]):
         for i in range(score.shape[0]):
@@ -144,16 +177,16 @@ def _keep_largest(score: Any, largest: Any) -> None:
 
 @kernel(nogil=True, fastmath=_FAST, error_model="numpy")
 def match_rows(
-    depth: Any,
-    rows: Any,
-    reference: Any,
-    mean: Any,
-    inverse_sigma: Any,
-    greys: Any,
-    sizes: Any,
-    per_depth: Any,
-    starts: Any,
-    out: Any,
+    depth: Float32Array,  # (H, W) float32
+    rows: IntArray,  # (2,) int64
+    reference: Float32Array,  # (H, W + 2 half) float32
+    mean: Float32Array,  # (H, W) float32
+    inverse_sigma: Float32Array,  # (H, W) float32
+    greys: Float32Array,  # (n, h + 1, w + 1) float32
+    sizes: Float32Array,  # (n, 2) float32
+    per_depth: Float32Array,  # (n, 3, 3) float32
+    starts: Float32Array,  # (n, 3) float32
+    out: Float32Array,  # (H, k, W) float32
 ) -> None:
     """Write the best correlations of some rows of a view with n neighbours, under a hypothesis of depth.
 
@@ -194,7 +227,15 @@ def match_rows(
 
 
 @kernel(nogil=True, error_model="numpy")
-def keep_winner(number: int, score: Any, last: Any, best: Any, before: Any, after: Any, hypothesis: Any) -> None:
+def keep_winner(
+    number: int,
+    score: Float32Array,  # (P,) float32
+    last: Float32Array,  # (P,) float32
+    best: Float32Array,  # (P,) float32
+    before: Float32Array,  # (P,) float32
+    after: Float32Array,  # (P,) float32
+    hypothesis: NDArray[np.int32],  # (P,) int32
+) -> None:
     """Compare the scores of hypothesis `number` with the best so far, pixel by pixel.
 
     Args:

@@ -9,14 +9,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from pipelines.core.child import run_in_child
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import BoolArray, FloatArray
+from pipelines.core.types import BoolArray, FloatArray, JsonValue
 from pipelines.formats.colmap import quiet_colmap
 from pipelines.formats.mesh_files import read_mesh_ply, write_mesh_ply, write_oriented_points
 from pipelines.surface.mesh import RawMesh, compact, parts_of
@@ -134,7 +133,7 @@ def near_points(mesh: RawMesh, points: MeasuredPoints) -> RawMesh:
     return compact(RawMesh(mesh.vertices, mesh.faces[kept]))
 
 
-def solve_poisson(arguments: Mapping[str, Any], progress: Progress) -> None:
+def solve_poisson(arguments: Mapping[str, JsonValue], progress: Progress) -> None:
     """Write the surface through the points of a file, in a child process."""
     with quiet_colmap() as colmap, progress.task("surface"):
         options = colmap.PoissonMeshingOptions(
@@ -163,7 +162,7 @@ def simplified(mesh: RawMesh, error_m: float, folder: Path, progress: Progress =
     return with_long_rims(simple, _RIM_ERRORS * error_m)
 
 
-def simplify(arguments: Mapping[str, Any], progress: Progress) -> None:
+def simplify(arguments: Mapping[str, JsonValue], progress: Progress) -> None:
     """Write the simplified mesh of a file, in a child process."""
     with quiet_colmap() as colmap, progress.task("simplification"):
         options = colmap.MeshSimplificationOptions(

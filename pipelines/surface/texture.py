@@ -7,7 +7,6 @@ faces. Where a chart folds over itself, both layers share their texels.
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -16,13 +15,22 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import ArrayHWC, ArrayN3, ArrayNK, BoolArray, ByteArray, FloatArray, IntArray
+from pipelines.core.types import (
+    ArrayHWC,
+    ArrayN3,
+    ArrayNK,
+    BoolArray,
+    ByteArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+)
 from pipelines.geometry.footprints import row_numbers, voxel_keys
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.kernel_cache import kernel
 from pipelines.surface.mesh import RawMesh, edges_of, vertex_normals
 from pipelines.surface.surface_views import SAME_SURFACE, SurfaceViews
-from pipelines.surface.visibility import point_in_cam, sees_sphere, surface_at
+from pipelines.surface.visibility import ViewArrays, point_in_cam, sees_sphere, surface_at
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
 
@@ -85,14 +93,14 @@ def _near_each_other(places: FloatArray) -> list[IntArray]:
 
 @kernel(parallel=True, nogil=True, error_model="numpy")
 def _add_colours(
-    points: ArrayN3,
-    normals: ArrayN3,
-    views: Any,
+    points: ArrayN3,  # (N, 3) float64
+    normals: ArrayN3,  # (N, 3) float64
+    views: ViewArrays,  # see `DepthViews`
     view: int,
-    photo: ArrayHWC,
-    plain: ArrayNK,
-    score: Any,
-    colour: Any,
+    photo: ArrayHWC,  # (H, W, 3) uint8
+    plain: ArrayNK,  # (3, 4) float64
+    score: Float32Array,  # (N, _BEST) float32
+    colour: Float32Array,  # (N, _BEST, 3) float32
 ) -> None:
     """Put a view among the best of the places that its depth map shows; scores are pixels on a square metre."""
     rotations, centers, intrinsics_px, sizes, starts, depth = views
@@ -126,7 +134,12 @@ def _add_colours(
 
 
 @njit(nogil=True, error_model="numpy")
-def _bilinear(photo: ArrayHWC, column: float, row: float, band: int) -> float:
+def _bilinear(
+    photo: ArrayHWC,  # (H, W, 3) uint8
+    column: float,
+    row: float,
+    band: int,
+) -> float:
     i, j = int(row), int(column)
     down, right = row - i, column - j
     above = (1 - right) * photo[i, j, band] + right * photo[i, j + 1, band]

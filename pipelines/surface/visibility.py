@@ -14,7 +14,6 @@ hides. The model has no say: a surface that training missed was seen all the sam
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -66,6 +65,10 @@ class DepthViews:
         size = np.array([[pinhole.width, pinhole.height] for pinhole in cameras.pinholes], dtype=np.int64)
         start = np.concatenate([[0], np.cumsum(size.prod(axis=1))[:-1]])
         return cls(cameras.cam_from_world, cameras.center_in_world, intrinsics, size, start, depth_m)
+
+
+# The arrays of `DepthViews`, for kernels.
+ViewArrays = tuple[FloatArray, FloatArray, FloatArray, IntArray, IntArray, Float32Array]
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,11 @@ def _blocks(points: FloatArray) -> IntArray:
 
 
 @njit(nogil=True, error_model="numpy")
-def point_in_cam(point: ArrayN, rotation: Array33, center: ArrayN) -> tuple[float, float, float]:
+def point_in_cam(
+    point: ArrayN,  # (3,) float64
+    rotation: Array33,  # (3, 3) float64
+    center: ArrayN,  # (3,) float64
+) -> tuple[float, float, float]:
     """Return a point in the camera's axes, from world coordinates, rotation cam ← world (3, 3) and centre."""
     x, y, z = 0.0, 0.0, 0.0
     for k in range(3):
@@ -160,7 +167,12 @@ def point_in_cam(point: ArrayN, rotation: Array33, center: ArrayN) -> tuple[floa
 
 @kernel(nogil=True, error_model="numpy")
 def sees_sphere(
-    middle: ArrayN, radius: float, rotation: Array33, center: ArrayN, intrinsics: ArrayN, size: ArrayN
+    middle: ArrayN,  # (3,) float64
+    radius: float,
+    rotation: Array33,  # (3, 3) float64
+    center: ArrayN,  # (3,) float64
+    intrinsics: ArrayN,  # (4,) float64
+    size: ArrayN,  # (2,) int64
 ) -> bool:
     """Return whether a sphere may touch the frustum of a camera."""
     x, y, z = point_in_cam(middle, rotation, center)
@@ -176,7 +188,14 @@ def sees_sphere(
 
 
 @njit(nogil=True, error_model="numpy")
-def surface_at(depth: ArrayN, start: int, width: int, height: int, u: float, v: float) -> float:
+def surface_at(
+    depth: ArrayN,  # (pixels,) float32
+    start: int,
+    width: int,
+    height: int,
+    u: float,
+    v: float,
+) -> float:
     """Return the depth of a view's surface at a place on its image; 0: none."""
     own = depth[start + int(v) * width + int(u)]
     column = min(max(int(np.floor(u - 0.5)), 0), width - 2)
@@ -198,7 +217,14 @@ def surface_at(depth: ArrayN, start: int, width: int, height: int, u: float, v: 
 
 @njit(nogil=True, error_model="numpy")
 def _add_view(
-    row: int, points: ArrayN3, normals: ArrayN3, views: Any, view: int, up: ArrayN, tolerance: float, sums: ArrayNK
+    row: int,
+    points: ArrayN3,  # (N, 3) float64
+    normals: ArrayN3,  # (N, 3) float64
+    views: ViewArrays,  # see `DepthViews`
+    view: int,
+    up: ArrayN,  # (3,) float64
+    tolerance: float,
+    sums: ArrayNK,  # (N, _SUMS) float64
 ) -> None:
     """Add a view to the sums of a point. Numbers rather than rows of arrays, each of which would be counted."""
     rotations, centers, intrinsics, sizes, starts, depth = views
@@ -247,7 +273,13 @@ def _add_view(
 
 @njit(nogil=True, error_model="numpy")
 def _sum_block(
-    rows: ArrayN, points: ArrayN3, normals: ArrayN3, views: Any, up: ArrayN, tolerance: float, sums: ArrayNK
+    rows: ArrayN,  # (R,) int64
+    points: ArrayN3,  # (N, 3) float64
+    normals: ArrayN3,  # (N, 3) float64
+    views: ViewArrays,  # see `DepthViews`
+    up: ArrayN,  # (3,) float64
+    tolerance: float,
+    sums: ArrayNK,  # (N, _SUMS) float64
 ) -> None:
     """Add all views to the sums of the points of one block."""
     low, high = points[rows[0]].copy(), points[rows[0]].copy()
@@ -267,7 +299,13 @@ def _sum_block(
 
 @kernel(parallel=True, nogil=True, error_model="numpy")
 def _sum_support(
-    points: ArrayN3, normals: ArrayN3, order: ArrayN, views: Any, up: ArrayN, tolerance: float, sums: ArrayNK
+    points: ArrayN3,  # (N, 3) float64
+    normals: ArrayN3,  # (N, 3) float64
+    order: ArrayN,  # (N,) int64
+    views: ViewArrays,  # see `DepthViews`
+    up: ArrayN,  # (3,) float64
+    tolerance: float,
+    sums: ArrayNK,  # (N, _SUMS) float64
 ) -> None:
     """Fill the sums (N, _SUMS) of all points, block by block; `order` puts the points of a block together."""
     for block in prange((len(order) + _BLOCK - 1) // _BLOCK):

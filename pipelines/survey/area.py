@@ -128,7 +128,7 @@ def boundary_area(options: AreaOptions, scene: FloatArray, origin: Origin | None
     return area
 
 
-def _with_short_edges(polygon: Any) -> Any:
+def _with_short_edges(polygon: shapely.Geometry) -> Any:
     west, south, east, north = shapely.bounds(polygon).tolist()
     return shapely.segmentize(polygon, max(east - west, north - south) / _EDGES)
 

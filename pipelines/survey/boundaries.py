@@ -23,7 +23,7 @@ import shapely
 
 from pipelines.core.errors import InputError
 from pipelines.core.types import FloatArray
-from pipelines.formats.boundary_file import Boundary, BoundaryLayer, read_boundary
+from pipelines.formats.boundary_file import Boundary, BoundaryLayer, Refusal, read_boundary
 from pipelines.geodesy.crs import PointCrs, parse_crs, proj_crs
 
 log = logging.getLogger(__name__)
@@ -129,7 +129,7 @@ def _are_equal(one: str, other: str) -> bool:
         return False
 
 
-def _require_degrees(outlines: Outlines, refusal: Any, crs_field: str) -> None:
+def _require_degrees(outlines: Outlines, refusal: Refusal, crs_field: str) -> None:
     """Refuse metres in a format whose coordinates are degrees where nothing else is said."""
     west, south, east, north = shapely.total_bounds(list(outlines.polygons)).tolist()
     if max(abs(west), abs(east)) > 720 or max(abs(south), abs(north)) > 90:
@@ -230,5 +230,5 @@ def _choices(one: Outlines) -> Iterator[tuple[Outlines, Any]]:
         yield replace(one, polygons=tuple(rest)), whole
 
 
-def _is_rectangle(polygon: Any) -> bool:
+def _is_rectangle(polygon: shapely.Geometry) -> bool:
     return float(shapely.oriented_envelope(polygon).area) * _RECTANGULAR <= float(polygon.area)

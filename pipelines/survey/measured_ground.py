@@ -42,7 +42,7 @@ class MeasuredGround(ArrayProduct):
     def save(self, path: Path) -> None:
         save_npz(path, vars(self))
 
-    def outline(self, within: Any, fill: float | None, *, wider: float = 1.0) -> Any | None:
+    def outline(self, within: shapely.Geometry, fill: float | None, *, wider: float = 1.0) -> Any | None:
         """Return the polygon of what is measured within another: holes up to a width filled, no spikes, no islands.
 
         `fill` is the width in metres. None: two metres and ten pixels, times `wider`, halved until no more than a
@@ -66,7 +66,7 @@ class MeasuredGround(ArrayProduct):
             found = measured
         return shapely.make_valid(self._polygon(found).intersection(within))
 
-    def share(self, polygon: Any) -> float:
+    def share(self, polygon: shapely.Geometry) -> float:
         """Return the measured share of the cells in a polygon."""
         inside = self._inside(polygon)
         shapely.prepare(polygon)
@@ -74,7 +74,7 @@ class MeasuredGround(ArrayProduct):
         known = max(float(inside.sum()), float(polygon.area) / self.cell_m**2)
         return float((self.measured & inside).sum()) / max(known, 1.0)
 
-    def _inside(self, polygon: Any) -> BoolArray:
+    def _inside(self, polygon: shapely.Geometry) -> BoolArray:
         rows, columns = (np.arange(size) + 0.5 for size in self.measured.shape)
         east, north = np.meshgrid(self.corner[0] + self.cell_m * columns, self.corner[1] + self.cell_m * rows)
         shapely.prepare(polygon)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pipelines.core.errors import InputError
 from pipelines.core.files import replacing
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray
+from pipelines.core.types import AnyArray, BoolArray, ByteArray, Float32Array, FloatArray
 from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.cameras import Camera, Lenses, Pinhole, distort, focal_and_center, refit_pinhole, undistort
 
@@ -139,7 +139,7 @@ class ImageCache:
         """
         return np.ascontiguousarray(_decoded(self._photographs[index])[..., ::-1])
 
-    def sampled(self, index: int, decoded: NDArray[Any], place: Float32Array) -> NDArray[Any]:
+    def sampled(self, index: int, decoded: AnyArray, place: Float32Array) -> NDArray[Any]:
         """Return the colours (…) or (…, 3) of a decoded photograph at places (…, 2) in pixels of its pinhole.
 
         The photograph is interpolated once, where reading its undistorted image would be the second time. The cache
@@ -368,7 +368,7 @@ def write_undistorted(folder: Path, photographs: list[Photograph], progress: Pro
     return [pinholes[index] for index in range(len(photographs))]
 
 
-def save_array(path: Path, array: NDArray[Any]) -> None:
+def save_array(path: Path, array: AnyArray) -> None:
     """Write an array to a temporary file, and rename that: the file at `path` is always complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f"{path.stem}.{uuid4().hex}.tmp")  # Several processes may make the same file at once.

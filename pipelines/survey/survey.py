@@ -16,7 +16,7 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from pipelines.core.errors import InputError
 from pipelines.core.options import WRITTEN, from_text, listed_names
 from pipelines.core.products import Covariance3, ImageName, Product, Remark, Rotation
-from pipelines.core.types import Matrix3, Vector3, vector3
+from pipelines.core.types import JsonValue, Matrix3, Vector3, vector3
 from pipelines.core.validators import image_dir
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum
@@ -319,7 +319,7 @@ class Survey(Product):
 
     @model_validator(mode="before")
     @classmethod
-    def _is_of_this_version(cls, document: Any) -> Any:
+    def _is_of_this_version(cls, document: JsonValue) -> Any:
         if isinstance(document, dict) and document.get("format_version") == 1:
             raise ValueError(
                 "an earlier version of georef made this survey, without the common errors of its positions: run "

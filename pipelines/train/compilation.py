@@ -6,7 +6,6 @@ training finds them in the user's cache.
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from pipelines.core.child import start_in_child
 from pipelines.core.errors import InputError, WorkspaceBusyError
 from pipelines.core.lock import WriteLock
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import JsonValue
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points
 from pipelines.splat.kernel_cache import cache_folder, compilation_stamp
@@ -43,7 +43,7 @@ def start_compilation() -> None:
         start_in_child(f"{__name__}:compile_in_child")
 
 
-def compile_in_child(_arguments: Mapping[str, Any], progress: Progress) -> None:
+def compile_in_child(_arguments: Mapping[str, JsonValue], progress: Progress) -> None:
     """Compile as `compile_kernels`, at the priority of a training that may wait for it: task of `core.child`.
 
     Where another process compiles already, it does so for this one too.

@@ -11,7 +11,6 @@ import json
 import logging
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from pipelines.adjust.solution import remarks_of
 from pipelines.adjust.system import minimise
 from pipelines.core.products import Remark, load_json, save_json, save_npz
 from pipelines.core.stages import HELD_OUT, LIDAR, LIDAR_MAP, MODEL, POINTS, SIM3_POSTERIOR, TRAIN_POSTERIOR
-from pipelines.core.types import vector3
+from pipelines.core.types import Json, vector3
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import write_gaussians
@@ -189,7 +188,7 @@ def trained_model(trainer: JointTrainer, solution: Solution) -> TrainedModel:
 
 
 def _summary(
-    model: TrainedModel, metrics: list[dict[str, Any]], record: TrainingRecord, lidar: LidarReport | None = None
+    model: TrainedModel, metrics: list[Json], record: TrainingRecord, lidar: LidarReport | None = None
 ) -> Summary:
     """Return headline, values and warnings of a training, given the rows of `metrics.jsonl`."""
     psnr = float(np.mean([row["psnr"] for row in metrics[-20:]]))

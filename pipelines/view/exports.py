@@ -1,10 +1,9 @@
 """A profile as CSV and DXF."""
 
-from typing import Any
-
 import numpy as np
 
 from pipelines.core.extras import require
+from pipelines.core.types import Json
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import drawing
 from pipelines.survey.target_crs import TargetCrs
@@ -14,7 +13,7 @@ _TYPES = {"csv": "text/csv; charset=utf-8", "dxf": "image/vnd.dxf"}
 _LAYERS = (("PROFILE", 0, 7), ("PROFILE_PLUS_SIGMA", 1, 8), ("PROFILE_MINUS_SIGMA", -1, 8))
 
 
-def profile_file(profile: dict[str, Any], form: str, target: TargetCrs) -> tuple[bytes, str, str]:
+def profile_file(profile: Json, form: str, target: TargetCrs) -> tuple[bytes, str, str]:
     """Return a profile as a file: its bytes, their type, and a name.
 
     The drawing (DXF) has distances in metres as x and heights as y.

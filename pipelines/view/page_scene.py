@@ -5,7 +5,6 @@ is not drawn: the commands say what is wrong.
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
@@ -13,7 +12,7 @@ import shapely
 from pipelines.core.errors import GeorefError
 from pipelines.core.sentences import without_folders
 from pipelines.core.stages import REPORT
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, Json
 from pipelines.core.workspace import Workspace
 from pipelines.formats.geotiff import sampled_raster
 from pipelines.formats.vector_files import read_contours, read_regions
@@ -30,7 +29,6 @@ from pipelines.survey.target_crs import TargetCrs, usable_crs
 from pipelines.view.measuring import MeasuringModel
 from pipelines.view.pictures import ViewFrame
 
-Json = dict[str, Any]
 _MOST_POINTS = 30_000  # SfM points that a page draws
 _MOST_PLACES = 200_000  # of contour lines, and of regions
 _LONGEST_ARROW = 0.07  # of the scene's radius: the arrow of the largest error

@@ -12,6 +12,7 @@ import http.client
 import json
 import logging
 import secrets
+import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
@@ -27,6 +28,7 @@ from tornado.web import Application, HTTPError, RequestHandler
 
 from pipelines.core.errors import GeorefError, StorageError
 from pipelines.core.progress import SILENT, Progress
+from pipelines.core.types import JsonValue
 from pipelines.core.workspace import Workspace
 from pipelines.survey.saved_measurements import NamedMeasurement
 from pipelines.view import requests
@@ -77,7 +79,7 @@ class ViewerServer:
         self._thread.start()
         self._started.wait()
 
-    def _serve(self, sockets: list[Any]) -> None:
+    def _serve(self, sockets: list[socket.socket]) -> None:
         asyncio.set_event_loop(self._loop)
         logging.getLogger("tornado.access").setLevel(logging.ERROR)
         server = HTTPServer(
@@ -161,11 +163,11 @@ class _Handler(RequestHandler):
     def on_connection_close(self) -> None:
         self._gone = True
 
-    def write_error(self, status_code: int, **_kwargs: Any) -> None:
+    def write_error(self, status_code: int, **_kwargs: object) -> None:
         text = {403: "Open the address that georef view printed.", 404: "Not found."}.get(status_code, "Failed.")
         self._finish_json({"error": text}, status_code)
 
-    def _finish_json(self, document: Any, status: int = HTTPStatus.OK) -> None:
+    def _finish_json(self, document: JsonValue, status: int = HTTPStatus.OK) -> None:
         self.set_status(status)
         self.set_header("Content-Type", "application/json; charset=utf-8")
         self.finish(json.dumps(document, allow_nan=False, separators=(",", ":")))

@@ -15,7 +15,7 @@ from pipelines.core.errors import InputError
 from pipelines.core.manifest import hash_file
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import GAUSSIANS, MODEL
-from pipelines.core.types import FloatArray
+from pipelines.core.types import ByteArray, FloatArray, Json
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.report.page import limited
@@ -45,7 +45,6 @@ from pipelines.view.quantities import Profile, distances, length
 from pipelines.view.saved import FOLDER, SavedMeasurements
 from pipelines.view.work import Jobs, ViewJob
 
-Json = dict[str, Any]
 _PIXEL_MARGIN = 0.02  # of a photograph: nearer to its rim a place is seen badly
 _MOST_SEEN = 24  # photographs in the strip
 
@@ -461,7 +460,7 @@ def profile_json(line: Profile) -> Json:
     }
 
 
-def jpeg_of(rgb: Any, quality: int) -> bytes:
+def jpeg_of(rgb: ByteArray, quality: int) -> bytes:
     """Return a picture (H, W, 3) of bytes, red first, as JPEG of a quality from 0 to 100."""
     _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return encoded.tobytes()

@@ -8,7 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from pydantic import BaseModel
+
 from pipelines.core.errors import GeorefError
+from pipelines.core.types import JsonValue
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +58,7 @@ class Jobs:
         self._lock = threading.Lock()
         self._last = 0
 
-    def begin(self, request: Any, work: Callable[[ViewJob], Iterable[Any]]) -> ViewJob:
+    def begin(self, request: BaseModel, work: Callable[[ViewJob], Iterable[JsonValue]]) -> ViewJob:
         """Begin a job whose work yields answers, each better than the one before."""
         with self._lock:
             self._last += 1
@@ -76,7 +79,7 @@ class Jobs:
         self._pool.shutdown(cancel_futures=True)
 
     @staticmethod
-    def _run(job: ViewJob, work: Callable[[ViewJob], Iterable[Any]]) -> None:
+    def _run(job: ViewJob, work: Callable[[ViewJob], Iterable[JsonValue]]) -> None:
         try:
             for answer in work(job):
                 job.answer = answer

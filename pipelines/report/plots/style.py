@@ -59,7 +59,7 @@ def add_scale(figure: Figure, image: ScalarMappable, text: str, **place: Any) ->
 
 
 def add_key(figure: Figure, columns: int, **place: Any) -> None:
-    """Add the legend of the first axes, if they have one, to the figure."""
+    """Add the legend of the first axes, if they have one, to the figure; `place` is where matplotlib puts it."""
     handles, names = figure.axes[0].get_legend_handles_labels()
     if names:
         columns = min(columns, len(names))
@@ -67,7 +67,7 @@ def add_key(figure: Figure, columns: int, **place: Any) -> None:
 
 
 def add_arrows(axes: Axes, start: FloatArray, arrow: FloatArray, **style: Any) -> None:
-    """Draw arrows (N, 2) in the units of the axes at their places (N, 2)."""
+    """Draw arrows (N, 2) in the units of the axes at their places (N, 2), in a style of matplotlib's `quiver`."""
     axes.quiver(*start.T, *arrow.T, angles="xy", scale_units="xy", scale=1, **style)
 
 

@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pipelines.core.errors import InputError
+from pipelines.core.types import AutogradContext
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer import cpu_blend, cpu_gaussian, cpu_gradients, cpu_project
@@ -126,7 +127,10 @@ class _Rasterize(torch.autograd.Function):
     """Raw parameters, pose (3, 4) and centre (3,) in; colour, alpha, Σ w z, Σ w z², median depth and normal out."""
 
     @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: AutogradContext,
+        *inputs: Any,  # tensors, and as the last the `_RenderContext`
+    ) -> tuple[Tensor, ...]:
         *tensors, context = inputs
         *parameters, pose, center = (_array(tensor) for tensor in tensors)
         with KERNEL_LOCK:
@@ -150,7 +154,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: AutogradContext, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         context: _RenderContext = ctx.context
         saved = [_array(tensor) for tensor in ctx.saved_tensors]
         *parameters, pose, center = saved[:7]

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 from numba import prange
+from numpy.typing import DTypeLike
 
-from pipelines.core.types import ArrayN, ArrayN3, ArrayNK
+from pipelines.core.types import ArrayHW, ArrayHWC, ArrayN, ArrayN3, ArrayNK
 from pipelines.splat.rasterizer.api import ALPHA_MAX, TRANSMITTANCE_MIN
 from pipelines.splat.rasterizer.cpu_lanes import (
     LANES,
+    Lanes,
     any_positive,
     exp,
     jit,
@@ -52,9 +54,15 @@ HITS_PER_CHECK = 16
 T, R, G, B, D, D2, MEDIAN, N_X, N_Y, N_Z = range(10)
 FORWARD_PLANES = 10
 
+# Colour, alpha, Σ w z, Σ w z², median depth and normal; ∂L/∂ all of them but the median depth.
+_Images = tuple[ArrayHWC, ArrayHW, ArrayHW, ArrayHW, ArrayHW, ArrayHWC]
+_ImageGradients = tuple[ArrayHWC, ArrayHW, ArrayHW, ArrayHW, ArrayHWC]
+
 
 @jit
-def pixel_centers(dtype: Any) -> Any:
+def pixel_centers(
+    dtype: DTypeLike,  # of the pixels: float32 or float64
+) -> Any:
     """Return the centres (LANES,) of a row's pixels, from its left end."""
     centers = np.empty(LANES, dtype)
     for lane in range(LANES):
@@ -63,7 +71,12 @@ def pixel_centers(dtype: Any) -> Any:
 
 
 @jit
-def row_exponent(table: ArrayNK, index: int, dx: Any, dy: Any) -> Any:
+def row_exponent(
+    table: ArrayNK,  # (M, SPLAT_WIDTH) float32/64
+    index: int,
+    dx: Lanes,  # px
+    dy: float,  # px
+) -> Any:
     """Return ln α of one splat along a row of pixels, before the cut-offs."""
     slanted = splat(table[index, FACTOR_XX]) * dx + splat(table[index, FACTOR_XY] * dy)
     vertical = table[index, FACTOR_YY] * dy
@@ -71,13 +84,24 @@ def row_exponent(table: ArrayNK, index: int, dx: Any, dy: Any) -> Any:
 
 
 @jit
-def row_depth(table: ArrayNK, index: int, dx: Any, dy: Any) -> Any:
+def row_depth(
+    table: ArrayNK,  # (M, SPLAT_WIDTH) float32/64
+    index: int,
+    dx: Lanes,  # px
+    dy: float,  # px
+) -> Any:
     """Return z of one splat along a row of pixels."""
     return splat(table[index, SLOPE_X]) * dx + splat(table[index, DEPTH] + table[index, SLOPE_Y] * dy)
 
 
 @jit
-def start_tile(scratch: ArrayN, tile_x: int, tile_y: int, width: int, height: int) -> None:
+def start_tile(
+    scratch: ArrayN,  # (planes · TILE_PIXELS,) float32/64
+    tile_x: int,
+    tile_y: int,
+    width: int,
+    height: int,
+) -> None:
     """Set T = 1 for pixels inside the image; pixels outside are done from the start. Other planes start at 0."""
     number = scratch.dtype.type
     for k in range(scratch.shape[0]):
@@ -89,7 +113,11 @@ def start_tile(scratch: ArrayN, tile_x: int, tile_y: int, width: int, height: in
 
 
 @jit
-def alive_rows(scratch: ArrayN, top: int, bottom: int) -> Any:
+def alive_rows(
+    scratch: ArrayN,  # (planes · TILE_PIXELS,) float32/64
+    top: int,
+    bottom: int,
+) -> Any:
     """Return first and last row of top … bottom with a pixel that is not done; top > bottom if there is none."""
     while top <= bottom and not any_positive(load(scratch, T * TILE_PIXELS + top * TILE_WIDTH)):
         top += 1
@@ -100,9 +128,17 @@ def alive_rows(scratch: ArrayN, top: int, bottom: int) -> Any:
 
 @jit
 def _blend_tile(
-    table: ArrayNK, normals: ArrayN3, hits: ArrayN, first: int, last: int, tile_x: int, tile_y: int, depth: bool,
-    scratch: ArrayN, lane_x: ArrayN,
-) -> int:  # fmt: skip
+    table: ArrayNK,  # (M, SPLAT_WIDTH) float32/64
+    normals: ArrayN3,  # (M or 0, 3) float32/64
+    hits: ArrayN,  # (H,) int64
+    first: int,
+    last: int,
+    tile_x: int,
+    tile_y: int,
+    depth: bool,
+    scratch: ArrayN,  # (planes · TILE_PIXELS,) float32/64
+    lane_x: ArrayN,  # (LANES,) float32/64
+) -> int:
     """Blend hits first … last − 1 into the tile's scratch planes; return the hit after the last one used."""
     number = table.dtype.type
     zero, one, half = splat(number(0.0)), splat(number(1.0)), splat(number(0.5))
@@ -148,7 +184,13 @@ def _blend_tile(
 
 
 @jit
-def _finish_tile(scratch: ArrayN, tile_x: int, tile_y: int, background: ArrayN, images: tuple[Any, ...]) -> None:
+def _finish_tile(
+    scratch: ArrayN,  # (planes · TILE_PIXELS,) float32/64
+    tile_x: int,
+    tile_y: int,
+    background: ArrayN,  # (3,) float64
+    images: _Images,  # (H, W, 3), 4 × (H, W), (H, W, 3) float32/64
+) -> None:
     colour, alpha, depth, depth2, median, normal = images
     for row in range(min(TILE_HEIGHT, colour.shape[0] - tile_y)):
         for column in range(min(TILE_WIDTH, colour.shape[1] - tile_x)):
@@ -170,9 +212,16 @@ def _finish_tile(scratch: ArrayN, tile_x: int, tile_y: int, background: ArrayN, 
 
 @worker_jit
 def _blend(
-    table: ArrayNK, normals: ArrayN3, hits: ArrayN, tile_start: ArrayN, background: ArrayN,
-    images: tuple[Any, ...], tile_end: ArrayN, worker: int, workers: int,
-) -> None:  # fmt: skip
+    table: ArrayNK,  # (M, SPLAT_WIDTH) float32/64
+    normals: ArrayN3,  # (M or 0, 3) float32/64
+    hits: ArrayN,  # (H,) int64
+    tile_start: ArrayN,  # (tiles + 1,) int64
+    background: ArrayN,  # (3,) float64
+    images: _Images,  # (H, W, 3), 4 × (H, W), (H, W, 3) float32/64
+    tile_end: ArrayN,  # (tiles,) int64
+    worker: int,
+    workers: int,
+) -> None:
     height, width = images[1].shape
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
     depth = images[2].shape[0] > 0
@@ -189,13 +238,13 @@ def _blend(
 
 @parallel_jit
 def blend(
-    table: ArrayNK,
-    normals: ArrayN3,
-    hits: ArrayN,
-    tile_start: ArrayN,
-    background: ArrayN,
-    images: tuple[Any, ...],
-    tile_end: ArrayN,
+    table: ArrayNK,  # (M, SPLAT_WIDTH) float32/64
+    normals: ArrayN3,  # (M or 0, 3) float32/64
+    hits: ArrayN,  # (H,) int64
+    tile_start: ArrayN,  # (tiles + 1,) int64
+    background: ArrayN,  # (3,) float64
+    images: _Images,  # (H, W, 3), 4 × (H, W), (H, W, 3) float32/64
+    tile_end: ArrayN,  # (tiles,) int64
     workers: int,
 ) -> None:
     """Blend the splats of all tiles into images.
@@ -227,7 +276,12 @@ NORMAL_WIDTH = 4  # of ∂L/∂ normal of a hit, with a zero behind it
 
 @jit
 def _start_tile_gradient(
-    scratch: ArrayN, tile_x: int, tile_y: int, background: ArrayN, images: tuple[Any, ...], grads: tuple[Any, ...]
+    scratch: ArrayN,  # (planes · TILE_PIXELS,) float32/64
+    tile_x: int,
+    tile_y: int,
+    background: ArrayN,  # (3,) float64
+    images: _Images,  # (H, W, 3), 4 × (H, W), (H, W, 3) float32/64
+    grads: _ImageGradients,  # (H, W, 3), 3 × (H, W), (H, W, 3) float32/64
 ) -> None:
     """Fill the scratch planes with the gradient of each pixel's colour, alpha and depth.
 
@@ -260,7 +314,13 @@ def _start_tile_gradient(
 
 
 @jit
-def _store_hit_gradient(gradient: ArrayN, place: int, dx: Any, moments: Any, colour_and_depth: Any) -> None:
+def _store_hit_gradient(
+    gradient: ArrayN,  # (H · HIT_GRADIENT_WIDTH,) float32/64
+    place: int,
+    dx: Lanes,  # px
+    moments: tuple[Lanes, Lanes, Lanes],  # Σ q, Σ q dy, Σ q dy²
+    colour_and_depth: tuple[Lanes, Lanes, Lanes, Lanes, Lanes],  # red, green, blue, depth, slope y
+) -> None:
     """Sum a hit's gradient over the columns, in each of which dx is constant."""
     q, qy, qyy = moments
     red, green, blue, depth, slope_y = colour_and_depth
@@ -272,9 +332,19 @@ def _store_hit_gradient(gradient: ArrayN, place: int, dx: Any, moments: Any, col
 
 @jit
 def _blend_tile_gradient(  # noqa: PLR0915  (one loop, whose sums stay in registers)
-    table: ArrayNK, normals: ArrayN3, hits: ArrayN, first: int, last: int, tile_x: int, tile_y: int, depth: bool,
-    scratch: ArrayN, lane_x: ArrayN, gradient: ArrayN, normal_gradient: ArrayN,
-) -> None:  # fmt: skip
+    table: ArrayNK,  # (M, SPLAT_WIDTH) float32/64
+    normals: ArrayN3,  # (M or 0, 3) float32/64
+    hits: ArrayN,  # (H,) int64
+    first: int,
+    last: int,
+    tile_x: int,
+    tile_y: int,
+    depth: bool,
+    scratch: ArrayN,  # (planes · TILE_PIXELS,) float32/64
+    lane_x: ArrayN,  # (LANES,) float32/64
+    gradient: ArrayN,  # (H · HIT_GRADIENT_WIDTH,) float32/64
+    normal_gradient: ArrayN,  # (H · NORMAL_WIDTH or 0,) float32/64
+) -> None:
     """Write the gradient of hits first … last − 1; `scratch` as `start_tile` and `_start_tile_gradient` left it.
 
     ∂L/∂α_i = T_i v_i − (Σ_{j>i} w_j v_j) / (1 − α_i), and q_i = ∂L/∂ln α_i = α_i ∂L/∂α_i.
@@ -346,10 +416,19 @@ def _blend_tile_gradient(  # noqa: PLR0915  (one loop, whose sums stay in regist
 
 @worker_jit
 def _blend_gradient(
-    table: ArrayNK, normals: ArrayN3, hits: ArrayN, tile_start: ArrayN, tile_end: ArrayN, background: ArrayN,
-    images: tuple[Any, ...], grads: tuple[Any, ...], gradient: ArrayN, normal_gradient: ArrayN, worker: int,
+    table: ArrayNK,  # (M, SPLAT_WIDTH) float32/64
+    normals: ArrayN3,  # (M or 0, 3) float32/64
+    hits: ArrayN,  # (H,) int64
+    tile_start: ArrayN,  # (tiles + 1,) int64
+    tile_end: ArrayN,  # (tiles,) int64
+    background: ArrayN,  # (3,) float64
+    images: _Images,  # (H, W, 3), 4 × (H, W), (H, W, 3) float32/64
+    grads: _ImageGradients,  # (H, W, 3), 3 × (H, W), (H, W, 3) float32/64
+    gradient: ArrayN,  # (H · HIT_GRADIENT_WIDTH,) float32/64
+    normal_gradient: ArrayN,  # (H · NORMAL_WIDTH or 0,) float32/64
+    worker: int,
     workers: int,
-) -> None:  # fmt: skip
+) -> None:
     height, width = images[1].shape
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
     depth = images[2].shape[0] > 0
@@ -370,9 +449,18 @@ def _blend_gradient(
 
 @parallel_jit
 def blend_gradient(
-    table: ArrayNK, normals: ArrayN3, hits: ArrayN, tile_start: ArrayN, tile_end: ArrayN, background: ArrayN,
-    images: tuple[Any, ...], grads: tuple[Any, ...], gradient: ArrayN, normal_gradient: ArrayN, workers: int,
-) -> None:  # fmt: skip
+    table: ArrayNK,  # (M, SPLAT_WIDTH) float32/64
+    normals: ArrayN3,  # (M or 0, 3) float32/64
+    hits: ArrayN,  # (H,) int64
+    tile_start: ArrayN,  # (tiles + 1,) int64
+    tile_end: ArrayN,  # (tiles,) int64
+    background: ArrayN,  # (3,) float64
+    images: _Images,  # (H, W, 3), 4 × (H, W), (H, W, 3) float32/64
+    grads: _ImageGradients,  # (H, W, 3), 3 × (H, W), (H, W, 3) float32/64
+    gradient: ArrayN,  # (H · HIT_GRADIENT_WIDTH,) float32/64
+    normal_gradient: ArrayN,  # (H · NORMAL_WIDTH or 0,) float32/64
+    workers: int,
+) -> None:
     """Write the derivative of `blend`.
 
     Args:

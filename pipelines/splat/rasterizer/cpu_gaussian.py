@@ -46,7 +46,11 @@ MAX_COEFFICIENTS = 16
 
 
 @jit
-def sh_basis(direction: Vector3, degree: int, basis: ArrayN) -> None:
+def sh_basis(
+    direction: Vector3,
+    degree: int,
+    basis: ArrayN,  # (MAX_COEFFICIENTS,) float64
+) -> None:
     """Write the (degree + 1)² functions of a unit vector (x, y, z) into `basis` (16,)."""
     x, y, z = direction
     basis[0] = _C0
@@ -73,7 +77,11 @@ def sh_basis(direction: Vector3, degree: int, basis: ArrayN) -> None:
 
 
 @jit
-def sh_direction_gradient(direction: Vector3, degree: int, weight: ArrayN) -> Any:
+def sh_direction_gradient(
+    direction: Vector3,
+    degree: int,
+    weight: ArrayN,  # (MAX_COEFFICIENTS,) float64
+) -> Any:
     """Return Σ_k weight[k] · ∂basis[k]/∂(x, y, z), with the polynomials as functions of all space."""
     x, y, z = direction
     gx, gy, gz = 0.0, 0.0, 0.0
@@ -224,13 +232,19 @@ def make_view(camera: Pinhole, settings: RasterSettings, pose: FloatArray) -> Vi
 
 
 @jit
-def row3(array: ArrayN3, i: int) -> Any:
+def row3(
+    array: ArrayN3,  # (N, 3) float32/64
+    i: int,
+) -> Any:
     """Return row i of an array (N, 3) as three numbers in double precision."""
     return float(array[i, 0]), float(array[i, 1]), float(array[i, 2])
 
 
 @jit
-def transformed_point(pose: Array34, mean: Vector3) -> Any:
+def transformed_point(
+    pose: Array34,  # (3, 4) float64
+    mean: Vector3,
+) -> Any:
     """Return (x, y, z) of a point under the rigid transformation `pose` (3, 4)."""
     x, y, z = mean
     return (
@@ -241,7 +255,10 @@ def transformed_point(pose: Array34, mean: Vector3) -> Any:
 
 
 @jit
-def unit_quat(quats: ArrayN4, i: int) -> Any:
+def unit_quat(
+    quats: ArrayN4,  # (N, 4) float32/64, w x y z
+    i: int,
+) -> Any:
     """Return row i of (N, 4) quaternions at unit length, and the reciprocal of the length."""
     w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
     scale = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
@@ -260,7 +277,10 @@ def rotation(quat: Vector4) -> Any:
 
 
 @jit
-def shortest_axis(log_scales: ArrayN3, i: int) -> int:
+def shortest_axis(
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    i: int,
+) -> int:
     """Return the principal axis (0, 1 or 2) of the smallest deviation of Gaussian i; the first of equal ones."""
     a, b, c = row3(log_scales, i)
     shortest = 1 if b < a else 0
@@ -280,7 +300,10 @@ def facing_normal(turn: Matrix9, axis: int, ray: Vector3) -> Any:
 
 
 @jit
-def variances(log_scales: ArrayN3, i: int) -> Any:
+def variances(
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    i: int,
+) -> Any:
     """Return the variances of Gaussian i along its principal axes, from natural logarithms of deviations (N, 3)."""
     a, b, c = row3(log_scales, i)
     return math.exp(2 * a), math.exp(2 * b), math.exp(2 * c)
@@ -296,7 +319,10 @@ def jacobian(view: View, point: Vector3) -> Any:
 
 
 @jit
-def screen_from_model(jac: Vector4, pose: Array34) -> Any:
+def screen_from_model(
+    jac: Vector4,
+    pose: Array34,  # (3, 4) float64
+) -> Any:
     """Return W (9), the linearised map from the model's frame to (u, v, z)."""
     j00, j02, j11, j12 = jac
     return (
@@ -369,7 +395,10 @@ def log_sigmoid(logit: float) -> float:
 
 
 @jit
-def unit_direction(mean: Vector3, center: ArrayN) -> Any:
+def unit_direction(
+    mean: Vector3,
+    center: ArrayN,  # (3,) float64
+) -> Any:
     """Return the unit vector from the camera's centre to a Gaussian, and the reciprocal of their distance."""
     x, y, z = mean[0] - center[0], mean[1] - center[1], mean[2] - center[2]
     scale = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
@@ -377,7 +406,12 @@ def unit_direction(mean: Vector3, center: ArrayN) -> Any:
 
 
 @jit
-def sh_colour(sh: ArrayNK3, i: int, basis: ArrayN, terms: int) -> Any:
+def sh_colour(
+    sh: ArrayNK3,  # (N, K, 3) float32/64
+    i: int,
+    basis: ArrayN,  # (MAX_COEFFICIENTS,) float64
+    terms: int,
+) -> Any:
     """Return red, green and blue of Gaussian i, not clamped at zero."""
     red, green, blue = 0.5, 0.5, 0.5
     for k in range(terms):

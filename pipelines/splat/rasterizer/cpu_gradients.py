@@ -45,7 +45,10 @@ from pipelines.splat.rasterizer.cpu_project import BLOCK
 
 
 @jit
-def _conic_gradients(cov: Vector3, sums: ArrayN) -> Any:
+def _conic_gradients(
+    cov: Vector3,
+    sums: ArrayN,  # (HIT_GRADIENT_WIDTH,) float64
+) -> Any:
     """Return ∂L/∂ screen mean (u, v) and the symmetric ∂L/∂C (xx, xy, yy) of the screen covariance C.
 
     The exponent is −½ dᵀ C⁻¹ d, so that the gradients are C⁻¹ Σ q d and ½ C⁻¹ (Σ q d dᵀ) C⁻¹.
@@ -61,7 +64,13 @@ def _conic_gradients(cov: Vector3, sums: ArrayN) -> Any:
 
 
 @jit
-def _covariance_gradients(axes: Matrix9, variance: Vector3, view: View, depth: float, sums: ArrayN) -> Any:
+def _covariance_gradients(
+    axes: Matrix9,
+    variance: Vector3,
+    view: View,
+    depth: float,
+    sums: ArrayN,  # (HIT_GRADIENT_WIDTH,) float64
+) -> Any:
     """Return ∂L/∂ screen mean (2), depth of the centre, screen covariance (3), covariance with the depth (2)."""
     cov = gaussian.screen_covariance(axes, variance, view.dilation)
     (gu, gv), (xx, xy, yy) = _conic_gradients(cov, sums)
@@ -143,7 +152,12 @@ def _quat_gradient(quat: Vector4, scale: float, turn: Matrix9) -> Any:
 
 @jit
 def _point_gradient(
-    view: View, point: Vector3, g_mean: Vector2, g_depth: float, pose: Array34, g_w: Matrix9
+    view: View,
+    point: Vector3,
+    g_mean: Vector2,
+    g_depth: float,
+    pose: Array34,  # (3, 4) float64
+    g_w: Matrix9,
 ) -> Any:
     """Return ∂L/∂ point in the camera's frame (3): through the screen mean, the depth and the Jacobian."""
     x, y, z = point
@@ -170,7 +184,13 @@ def _point_gradient(
 
 
 @jit
-def _add_pose_gradient(camera: ArrayN, mean: Vector3, g_point: Vector3, jac: Vector4, g_w: Matrix9) -> None:
+def _add_pose_gradient(
+    camera: ArrayN,  # (CAMERA_WIDTH,) float64
+    mean: Vector3,
+    g_point: Vector3,
+    jac: Vector4,
+    g_w: Matrix9,
+) -> None:
     """Add ∂L/∂[A | t] (12) of p = A m + t and W."""
     j00, j02, j11, j12 = jac
     x, y, z = mean
@@ -191,14 +211,14 @@ def _add_pose_gradient(camera: ArrayN, mean: Vector3, g_point: Vector3, jac: Vec
 
 @jit
 def colour_gradient(
-    sh: ArrayNK3,
+    sh: ArrayNK3,  # (N, K, 3) float32/64
     i: int,
     direction: Vector3,
     degree: int,
-    sums: ArrayN,
-    basis: ArrayN,
-    weight: ArrayN,
-    g_sh: ArrayNK3,
+    sums: ArrayN,  # (HIT_GRADIENT_WIDTH,) float64
+    basis: ArrayN,  # (MAX_COEFFICIENTS,) float64
+    weight: ArrayN,  # (MAX_COEFFICIENTS,) float64
+    g_sh: ArrayNK3,  # (N, K, 3) float32/64
 ) -> Any:
     """Write row i of ∂L/∂ SH, and return ∂L/∂ direction, with the basis as functions of all space."""
     terms = (degree + 1) ** 2
@@ -224,9 +244,19 @@ def unnormalised(direction: Vector3, scale: float, gradient: Vector3) -> Any:
 
 @jit
 def geometry_gradient(
-    quats: ArrayN4, log_scales: ArrayN3, i: int, mean: Vector3, direction: Vector3, pose: Array34, view: View,
-    sums: ArrayN, g_normal: ArrayN, camera: ArrayN, g_quats: ArrayN4, g_log_scales: ArrayN3,
-) -> Any:  # fmt: skip
+    quats: ArrayN4,  # (N, 4) float32/64, w x y z
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    i: int,
+    mean: Vector3,
+    direction: Vector3,
+    pose: Array34,  # (3, 4) float64
+    view: View,
+    sums: ArrayN,  # (HIT_GRADIENT_WIDTH,) float64
+    g_normal: ArrayN,  # (NORMAL_WIDTH,) float64
+    camera: ArrayN,  # (CAMERA_WIDTH,) float64
+    g_quats: ArrayN4,  # (N, 4) float32/64
+    g_log_scales: ArrayN3,  # (N, 3) float32/64
+) -> Any:
     """Write row i of ∂L/∂ quaternion and log scales, add to ∂L/∂ pose; return ∂L/∂ point and screen mean."""
     point = gaussian.transformed_point(pose, mean)
     quat, scale = gaussian.unit_quat(quats, i)
@@ -260,7 +290,13 @@ CAMERA_WIDTH = 15
 
 @jit
 def _sum_hits(
-    gradient: ArrayN, width: int, places: ArrayN, splat_start: ArrayN, first: int, last: int, sums: ArrayNK
+    gradient: ArrayN,  # (H · width,) float32/64
+    width: int,
+    places: ArrayN,  # (H,) int64
+    splat_start: ArrayN,  # (M + 1,) int64
+    first: int,
+    last: int,
+    sums: ArrayNK,  # (last − first or more, width) float64
 ) -> None:
     """Write the sums (last − first, width) of the hits of some splats.
 
@@ -278,12 +314,31 @@ def _sum_hits(
 
 @worker_jit
 def _gaussian_gradients(
-    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, sh: ArrayNK3, pose: Array34,
-    center: ArrayN, view: View, degree: int, visible: ArrayN, gradient: ArrayN, normal_gradient: ArrayN,
-    splat_start: ArrayN, places: ArrayN, block_start: ArrayN, g_means: ArrayN3, g_quats: ArrayN4,
-    g_log_scales: ArrayN3, g_logits: ArrayN, g_sh: ArrayNK3, camera: ArrayNK, g_screen: ArrayNK, worker: int,
+    means: ArrayN3,  # (N, 3) float32/64
+    quats: ArrayN4,  # (N, 4) float32/64, w x y z
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    logit_opacities: ArrayN,  # (N,) float32/64
+    sh: ArrayNK3,  # (N, K, 3) float32/64
+    pose: Array34,  # (3, 4) float64
+    center: ArrayN,  # (3,) float64
+    view: View,
+    degree: int,
+    visible: ArrayN,  # (M,) int64
+    gradient: ArrayN,  # (H · HIT_GRADIENT_WIDTH,) float32/64
+    normal_gradient: ArrayN,  # (H · NORMAL_WIDTH or 0,) float32/64
+    splat_start: ArrayN,  # (M + 1,) int64
+    places: ArrayN,  # (H,) int64
+    block_start: ArrayN,  # (blocks + 1,) int64
+    g_means: ArrayN3,  # (N, 3) float32/64
+    g_quats: ArrayN4,  # (N, 4) float32/64
+    g_log_scales: ArrayN3,  # (N, 3) float32/64
+    g_logits: ArrayN,  # (N,) float32/64
+    g_sh: ArrayNK3,  # (N, K, 3) float32/64
+    camera: ArrayNK,  # (blocks, CAMERA_WIDTH) float64
+    g_screen: ArrayNK,  # (M, 2) float32
+    worker: int,
     workers: int,
-) -> None:  # fmt: skip
+) -> None:
     block_sums, share = np.empty((BLOCK, HIT_GRADIENT_WIDTH)), np.empty(CAMERA_WIDTH)
     basis, weight = np.empty(MAX_COEFFICIENTS), np.empty(MAX_COEFFICIENTS)
     block_normals = np.zeros((BLOCK, NORMAL_WIDTH))
@@ -319,11 +374,30 @@ def _gaussian_gradients(
 
 @parallel_jit
 def gaussian_gradients(
-    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, sh: ArrayNK3, pose: Array34,
-    center: ArrayN, view: View, degree: int, visible: ArrayN, gradient: ArrayN, normal_gradient: ArrayN,
-    splat_start: ArrayN, places: ArrayN, block_start: ArrayN, g_means: ArrayN3, g_quats: ArrayN4,
-    g_log_scales: ArrayN3, g_logits: ArrayN, g_sh: ArrayNK3, camera: ArrayNK, g_screen: ArrayNK, workers: int,
-) -> None:  # fmt: skip
+    means: ArrayN3,  # (N, 3) float32/64
+    quats: ArrayN4,  # (N, 4) float32/64, w x y z
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    logit_opacities: ArrayN,  # (N,) float32/64
+    sh: ArrayNK3,  # (N, K, 3) float32/64
+    pose: Array34,  # (3, 4) float64
+    center: ArrayN,  # (3,) float64
+    view: View,
+    degree: int,
+    visible: ArrayN,  # (M,) int64
+    gradient: ArrayN,  # (H · HIT_GRADIENT_WIDTH,) float32/64
+    normal_gradient: ArrayN,  # (H · NORMAL_WIDTH or 0,) float32/64
+    splat_start: ArrayN,  # (M + 1,) int64
+    places: ArrayN,  # (H,) int64
+    block_start: ArrayN,  # (blocks + 1,) int64
+    g_means: ArrayN3,  # (N, 3) float32/64
+    g_quats: ArrayN4,  # (N, 4) float32/64
+    g_log_scales: ArrayN3,  # (N, 3) float32/64
+    g_logits: ArrayN,  # (N,) float32/64
+    g_sh: ArrayNK3,  # (N, K, 3) float32/64
+    camera: ArrayNK,  # (blocks, CAMERA_WIDTH) float64
+    g_screen: ArrayNK,  # (M, 2) float32
+    workers: int,
+) -> None:
     """Sum the gradients of hits by Gaussian, and propagate them back through the projection and the colours.
 
     Args:

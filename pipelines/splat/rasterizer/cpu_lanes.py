@@ -23,6 +23,10 @@ import numba.extending
 from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
+from numba.core.base import BaseContext as TargetContext
+from numba.core.datamodel.manager import DataModelManager
+from numba.core.typing.context import BaseContext as TypingContext
+from numba.core.typing.templates import Signature
 from numba.extending import models, overload, register_model
 
 from pipelines.splat.kernel_cache import kernel
@@ -31,6 +35,11 @@ LANES = 16
 
 # Any, because numba adds the typing context as a first argument, which kernels do not pass.
 intrinsic: Any = numba.extending.intrinsic
+
+# Value of the type `LanesType` in a kernel; where numba asks for an implementation, the type of the value: it wants
+# the same annotations there and in the implementation.
+Lanes = Any
+_ArrayType = Any  # `types.Array` of floats, one-dimensional and contiguous
 
 _INDEX = ir.IntType(32)
 
@@ -45,22 +54,26 @@ class LanesType(types.Type):
 
 @register_model(LanesType)
 class _LanesModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, numba_type: LanesType) -> None:
+    def __init__(self, manager: DataModelManager, numba_type: LanesType) -> None:
         element = manager.lookup(numba_type.element).get_value_type()
         super().__init__(manager, numba_type, ir.VectorType(element, LANES))
 
 
-def _row_pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+def _row_pointer(
+    context: TargetContext, builder: ir.IRBuilder, array_type: _ArrayType, array: ir.Value, index: ir.Value
+) -> ir.Value:
     start = builder.gep(context.make_array(array_type)(context, builder, array).data, [index])
     vector = ir.VectorType(context.get_value_type(array_type.dtype), LANES)
     return builder.bitcast(start, vector.as_pointer())
 
 
 @intrinsic
-def load(typing_context: Any, array: Any, index: Any) -> Any:
+def load(typing_context: TypingContext, array: _ArrayType, index: types.Integer) -> Any:
     """Load `array[index : index + LANES]` of a contiguous 1-D array; not checked."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def generate(
+        context: TargetContext, builder: ir.IRBuilder, signature: Signature, args: list[ir.Value]
+    ) -> ir.Value:
         pointer = _row_pointer(context, builder, array, args[0], args[1])
         return builder.load(pointer, align=array.dtype.bitwidth // 8)
 
@@ -68,10 +81,12 @@ def load(typing_context: Any, array: Any, index: Any) -> Any:
 
 
 @intrinsic
-def store(typing_context: Any, array: Any, index: Any, lanes: Any) -> Any:
+def store(typing_context: TypingContext, array: _ArrayType, index: types.Integer, lanes: LanesType) -> Any:
     """Store `array[index : index + LANES] = lanes` in a contiguous 1-D array; not checked."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def generate(
+        context: TargetContext, builder: ir.IRBuilder, signature: Signature, args: list[ir.Value]
+    ) -> ir.Value:
         pointer = _row_pointer(context, builder, array, args[0], args[1])
         builder.store(args[2], pointer, align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
@@ -80,10 +95,12 @@ def store(typing_context: Any, array: Any, index: Any, lanes: Any) -> Any:
 
 
 @intrinsic
-def splat(typing_context: Any, number: Any) -> Any:
+def splat(typing_context: TypingContext, number: types.Float) -> Any:
     """Return the same number in every lane."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def generate(
+        context: TargetContext, builder: ir.IRBuilder, signature: Signature, args: list[ir.Value]
+    ) -> ir.Value:
         vector = context.get_value_type(signature.return_type)
         undefined = ir.Constant(vector, ir.Undefined)
         first = builder.insert_element(undefined, args[0], _INDEX(0))
@@ -93,20 +110,26 @@ def splat(typing_context: Any, number: Any) -> Any:
 
 
 @intrinsic
-def where_greater(typing_context: Any, a: Any, b: Any, chosen: Any, otherwise: Any) -> Any:
+def where_greater(
+    typing_context: TypingContext, a: LanesType, b: LanesType, chosen: LanesType, otherwise: LanesType
+) -> Any:
     """Return `chosen` in the lanes where a > b, `otherwise` in the others."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def generate(
+        context: TargetContext, builder: ir.IRBuilder, signature: Signature, args: list[ir.Value]
+    ) -> ir.Value:
         return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[2], args[3])
 
     return chosen(a, a, chosen, chosen), generate
 
 
 @intrinsic
-def any_positive(typing_context: Any, lanes: Any) -> Any:
+def any_positive(typing_context: TypingContext, lanes: LanesType) -> Any:
     """Return whether any lane is above zero."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def generate(
+        context: TargetContext, builder: ir.IRBuilder, signature: Signature, args: list[ir.Value]
+    ) -> ir.Value:
         positive = builder.fcmp_ordered(">", args[0], ir.Constant(args[0].type, None))
         bits = builder.bitcast(positive, ir.IntType(LANES))
         return builder.icmp_unsigned("!=", bits, ir.IntType(LANES)(0))
@@ -114,7 +137,7 @@ def any_positive(typing_context: Any, lanes: Any) -> Any:
     return types.boolean(lanes), generate
 
 
-def _fold(builder: Any, a: Any, b: Any, low: list[int], high: list[int]) -> Any:
+def _fold(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, low: list[int], high: list[int]) -> ir.Value:
     """Return the sum of two shuffles of the vectors a and b."""
     halves = (
         builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INDEX, len(mask)), mask)) for mask in (low, high)
@@ -123,7 +146,15 @@ def _fold(builder: Any, a: Any, b: Any, low: list[int], high: list[int]) -> Any:
 
 
 @intrinsic
-def store_totals(typing_context: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+def store_totals(
+    typing_context: TypingContext,
+    array: _ArrayType,
+    index: types.Integer,
+    a: LanesType,
+    b: LanesType,
+    c: LanesType,
+    d: LanesType,
+) -> Any:
     """Store `array[index : index + 4] = a.sum(), b.sum(), c.sum(), d.sum()`, always added in the same order.
 
     The four sums share their shuffles: within each group of four lanes first, then across the groups.
@@ -132,7 +163,9 @@ def store_totals(typing_context: Any, array: Any, index: Any, a: Any, b: Any, c:
     pairs = [[k + step for k in fours for step in (s, LANES + s, 1 + s, LANES + 1 + s)] for s in (0, 2)]
     quads = [[k + step for k in fours for step in (s, 1 + s, LANES + s, LANES + 1 + s)] for s in (0, 2)]
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def generate(
+        context: TargetContext, builder: ir.IRBuilder, signature: Signature, args: list[ir.Value]
+    ) -> ir.Value:
         first = _fold(builder, args[2], args[3], *pairs)
         second = _fold(builder, args[4], args[5], *pairs)
         totals = _fold(builder, first, second, *quads)
@@ -148,17 +181,19 @@ def store_totals(typing_context: Any, array: Any, index: Any, a: Any, b: Any, c:
     return types.void(array, types.intp, a, a, a, a), generate
 
 
-def _define_operator(function: Callable[..., Any], instruction: str) -> None:
+def _define_operator(function: Callable[[float, float], float], instruction: str) -> None:
     @intrinsic
-    def apply(typing_context: Any, a: Any, b: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def apply(typing_context: TypingContext, a: LanesType, b: LanesType) -> Any:
+        def generate(
+            context: TargetContext, builder: ir.IRBuilder, signature: Signature, args: list[ir.Value]
+        ) -> ir.Value:
             return getattr(builder, instruction)(*args)
 
         return a(a, a), generate
 
     @overload(function)
-    def resolve(a: Any, b: Any) -> Any:
-        def implementation(a: Any, b: Any) -> Any:
+    def resolve(a: Lanes, b: Lanes) -> Callable[[Lanes, Lanes], Lanes] | None:
+        def implementation(a: Lanes, b: Lanes) -> Lanes:
             return apply(a, b)
 
         return implementation if isinstance(a, LanesType) and a == b else None
@@ -171,8 +206,10 @@ _define_operator(operator.truediv, "fdiv")
 
 
 @intrinsic
-def _libm_exp(typing_context: Any, lanes: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+def _libm_exp(typing_context: TypingContext, lanes: LanesType) -> Any:
+    def generate(
+        context: TargetContext, builder: ir.IRBuilder, signature: Signature, args: list[ir.Value]
+    ) -> ir.Value:
         kind = ir.FunctionType(args[0].type, [args[0].type])
         name = f"llvm.exp.v{LANES}f{lanes.element.bitwidth}"
         return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), args)
@@ -180,17 +217,17 @@ def _libm_exp(typing_context: Any, lanes: Any) -> Any:
     return lanes(lanes), generate
 
 
-def exp(x: Any) -> Any:
+def exp(x: Lanes) -> Lanes:
     """Return e^x in kernels: in float32 to 3e-6 relative for −5.56 ≤ x ≤ 0, and anything, even NaN, elsewhere."""
     raise NotImplementedError("only inside numba kernels")
 
 
 @overload(exp, jit_options={"fastmath": {"contract"}})
-def _resolve_exp(x: Any) -> Any:
-    def libm(x: Any) -> Any:
+def _resolve_exp(x: Lanes) -> Callable[[Lanes], Lanes]:
+    def libm(x: Lanes) -> Lanes:
         return _libm_exp(x)
 
-    def polynomial(x: Any) -> Any:
+    def polynomial(x: Lanes) -> Lanes:
         # The minimax polynomial of e^(x/8), to the eighth power, needs neither bit operations nor tables.
         y = splat(types.float32(1.788867319255094e-07))
         y = y * x + splat(types.float32(9.716052147757105e-06))

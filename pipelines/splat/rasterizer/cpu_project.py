@@ -36,7 +36,14 @@ ELLIPSE_WIDTH = 6
 
 
 @jit
-def _ellipse(means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, pose: Array34, view: View, i: int) -> Any:
+def _ellipse(
+    means: ArrayN3,  # (N, 3) float32/64
+    quats: ArrayN4,  # (N, 4) float32/64, w x y z
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    pose: Array34,  # (3, 4) float64
+    view: View,
+    i: int,
+) -> Any:
     """Return the point in the camera's frame, screen covariance and slope of the depth of Gaussian i."""
     point = gaussian.transformed_point(pose, gaussian.row3(means, i))
     quat, _ = gaussian.unit_quat(quats, i)
@@ -68,7 +75,13 @@ def _may_reach_image(point: Vector3, largest_log_scale: float, view: View) -> bo
 
 @jit
 def _is_visible(
-    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit: float, pose: Array34, view: View, i: int
+    means: ArrayN3,  # (N, 3) float32/64
+    quats: ArrayN4,  # (N, 4) float32/64, w x y z
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    logit: float,
+    pose: Array34,  # (3, 4) float64
+    view: View,
+    i: int,
 ) -> bool:
     """Return whether the ellipse in which Gaussian i reaches ALPHA_MIN has a pixel in its bounding box.
 
@@ -89,7 +102,12 @@ def _is_visible(
 
 @jit
 def _is_surely_visible(
-    quats: ArrayN4, log_scales: ArrayN3, logit: float, point: Vector3, view: View, i: int
+    quats: ArrayN4,  # (N, 4) float32/64, w x y z
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    logit: float,
+    point: Vector3,
+    view: View,
+    i: int,
 ) -> bool:
     """Return True only for a centre in the image whose ellipse holds a pixel by the image's dilation alone.
 
@@ -115,9 +133,18 @@ def _is_surely_visible(
 
 @worker_jit
 def _find_visible(
-    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, pose: Array34, view: View,
-    roughly: bool, visible: ArrayN, depth: ArrayN, worker: int, workers: int,
-) -> None:  # fmt: skip
+    means: ArrayN3,  # (N, 3) float32/64
+    quats: ArrayN4,  # (N, 4) float32/64, w x y z
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    logit_opacities: ArrayN,  # (N,) float32/64
+    pose: Array34,  # (3, 4) float64
+    view: View,
+    roughly: bool,
+    visible: ArrayN,  # (N,) bool
+    depth: ArrayN,  # (N,) float32/64
+    worker: int,
+    workers: int,
+) -> None:
     for block in range(worker, (means.shape[0] + BLOCK - 1) // BLOCK, workers):
         for i in range(block * BLOCK, min((block + 1) * BLOCK, means.shape[0])):
             visible[i] = False
@@ -137,9 +164,17 @@ def _find_visible(
 
 @parallel_jit
 def find_visible(
-    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, pose: Array34, view: View,
-    roughly: bool, visible: ArrayN, depth: ArrayN, workers: int,
-) -> None:  # fmt: skip
+    means: ArrayN3,  # (N, 3) float32/64
+    quats: ArrayN4,  # (N, 4) float32/64, w x y z
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    logit_opacities: ArrayN,  # (N,) float32/64
+    pose: Array34,  # (3, 4) float64
+    view: View,
+    roughly: bool,
+    visible: ArrayN,  # (N,) bool
+    depth: ArrayN,  # (N,) float32/64
+    workers: int,
+) -> None:
     """Write the visibility (N,) of N Gaussians, and the depth (N,) of the visible, on `workers` threads.
 
     Found `roughly`, more are visible than touch the image, for less work.
@@ -153,7 +188,12 @@ def find_visible(
 
 @jit
 def _write_splat(
-    splats: ArrayNK, ellipses: ArrayNK, row: int, center: Vector2, cov: Vector3, log_opacity: float
+    splats: ArrayNK,  # (M, SPLAT_WIDTH) float32/64
+    ellipses: ArrayNK,  # (M, ELLIPSE_WIDTH) float32/64
+    row: int,
+    center: Vector2,
+    cov: Vector3,
+    log_opacity: float,
 ) -> None:
     """Fill the rows for blending (without colour, depth and slope) and for binning.
 
@@ -175,10 +215,22 @@ def _write_splat(
 
 @worker_jit
 def _project_visible(
-    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, sh: ArrayNK3, pose: Array34,
-    center: ArrayN, view: View, degree: int, visible: ArrayN, splats: ArrayNK, ellipses: ArrayNK, normals: ArrayN3,
-    worker: int, workers: int,
-) -> None:  # fmt: skip
+    means: ArrayN3,  # (N, 3) float32/64
+    quats: ArrayN4,  # (N, 4) float32/64, w x y z
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    logit_opacities: ArrayN,  # (N,) float32/64
+    sh: ArrayNK3,  # (N, K, 3) float32/64
+    pose: Array34,  # (3, 4) float64
+    center: ArrayN,  # (3,) float64
+    view: View,
+    degree: int,
+    visible: ArrayN,  # (M,) int64
+    splats: ArrayNK,  # (M, SPLAT_WIDTH) float32/64
+    ellipses: ArrayNK,  # (M, ELLIPSE_WIDTH) float32/64
+    normals: ArrayN3,  # (M or 0, 3) float32/64
+    worker: int,
+    workers: int,
+) -> None:
     basis = np.empty(MAX_COEFFICIENTS)
     count = visible.shape[0]
     for block in range(worker, (count + BLOCK - 1) // BLOCK, workers):
@@ -205,10 +257,21 @@ def _project_visible(
 
 @parallel_jit
 def project_visible(
-    means: ArrayN3, quats: ArrayN4, log_scales: ArrayN3, logit_opacities: ArrayN, sh: ArrayNK3, pose: Array34,
-    center: ArrayN, view: View, degree: int, visible: ArrayN, splats: ArrayNK, ellipses: ArrayNK, normals: ArrayN3,
+    means: ArrayN3,  # (N, 3) float32/64
+    quats: ArrayN4,  # (N, 4) float32/64, w x y z
+    log_scales: ArrayN3,  # (N, 3) float32/64
+    logit_opacities: ArrayN,  # (N,) float32/64
+    sh: ArrayNK3,  # (N, K, 3) float32/64
+    pose: Array34,  # (3, 4) float64
+    center: ArrayN,  # (3,) float64
+    view: View,
+    degree: int,
+    visible: ArrayN,  # (M,) int64
+    splats: ArrayNK,  # (M, SPLAT_WIDTH) float32/64
+    ellipses: ArrayNK,  # (M, ELLIPSE_WIDTH) float32/64
+    normals: ArrayN3,  # (M or 0, 3) float32/64
     workers: int,
-) -> None:  # fmt: skip
+) -> None:
     """Fill the tables of the M visible Gaussians.
 
     Args:
@@ -256,7 +319,11 @@ def _clamp_to_int(value: float, low: int, high: int) -> int:
 
 
 @jit
-def _column_span(ellipses: ArrayNK, splat: int, width: int) -> Any:
+def _column_span(
+    ellipses: ArrayNK,  # (M, ELLIPSE_WIDTH) float32/64
+    splat: int,
+    width: int,
+) -> Any:
     """Return the first and last column of tiles; first > last if there is none."""
     x = float(ellipses[splat, E_X])
     extent = math.sqrt(float(ellipses[splat, E_LEVEL]) * float(ellipses[splat, E_XX]))
@@ -268,7 +335,12 @@ def _column_span(ellipses: ArrayNK, splat: int, width: int) -> Any:
 
 
 @jit
-def _row_span(ellipses: ArrayNK, splat: int, column: int, height: int) -> Any:
+def _row_span(
+    ellipses: ArrayNK,  # (M, ELLIPSE_WIDTH) float32/64
+    splat: int,
+    column: int,
+    height: int,
+) -> Any:
     """Return the first and last row of pixels that the ellipse touches within a column of tiles.
 
     At a distance dx from the centre the ellipse spans dx · xy/xx ± sqrt((level − dx²/xx) · det/xx). The upper
@@ -293,7 +365,13 @@ def _row_span(ellipses: ArrayNK, splat: int, column: int, height: int) -> Any:
 
 @worker_jit
 def _count_hits(
-    ellipses: ArrayNK, order: ArrayN, width: int, height: int, per_tile: ArrayNK, per_splat: ArrayN, run: int
+    ellipses: ArrayNK,  # (M, ELLIPSE_WIDTH) float32/64
+    order: ArrayN,  # (M,) int64
+    width: int,
+    height: int,
+    per_tile: ArrayNK,  # (RUNS, tiles) int64
+    per_splat: ArrayN,  # (M,) int64
+    run: int,
 ) -> None:
     splats = order.shape[0]
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
@@ -314,7 +392,12 @@ def _count_hits(
 
 @parallel_jit
 def count_hits(
-    ellipses: ArrayNK, order: ArrayN, width: int, height: int, per_tile: ArrayNK, per_splat: ArrayN
+    ellipses: ArrayNK,  # (M, ELLIPSE_WIDTH) float32/64
+    order: ArrayN,  # (M,) int64
+    width: int,
+    height: int,
+    per_tile: ArrayNK,  # (RUNS, tiles) int64
+    per_splat: ArrayN,  # (M,) int64
 ) -> None:
     """Count the tiles of splats (M, ELLIPSE_WIDTH), nearest first in `order` (M,), in an image of some pixels.
 
@@ -325,7 +408,10 @@ def count_hits(
 
 
 @kernel_jit
-def starts_from_counts(per_tile: ArrayNK, tile_start: ArrayN) -> None:
+def starts_from_counts(
+    per_tile: ArrayNK,  # (RUNS, tiles) int64
+    tile_start: ArrayN,  # (tiles + 1,) int64
+) -> None:
     """Turn `per_tile` (RUNS, tiles) into the place of each run's first hit; fill `tile_start` (tiles + 1,)."""
     place = 0
     for tile in range(per_tile.shape[1]):
@@ -339,9 +425,16 @@ def starts_from_counts(per_tile: ArrayNK, tile_start: ArrayN) -> None:
 
 @worker_jit
 def _list_hits(
-    ellipses: ArrayNK, order: ArrayN, width: int, height: int, next_place: ArrayNK, splat_start: ArrayN,
-    hits: ArrayN, places: ArrayN, run: int,
-) -> None:  # fmt: skip
+    ellipses: ArrayNK,  # (M, ELLIPSE_WIDTH) float32/64
+    order: ArrayN,  # (M,) int64
+    width: int,
+    height: int,
+    next_place: ArrayNK,  # (RUNS, tiles) int64
+    splat_start: ArrayN,  # (M + 1,) int64
+    hits: ArrayN,  # (H,) int64
+    places: ArrayN,  # (H,) int64
+    run: int,
+) -> None:
     splats = order.shape[0]
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
     for rank in range(splats * run // RUNS, splats * (run + 1) // RUNS):
@@ -363,14 +456,14 @@ def _list_hits(
 
 @parallel_jit
 def list_hits(
-    ellipses: ArrayNK,
-    order: ArrayN,
+    ellipses: ArrayNK,  # (M, ELLIPSE_WIDTH) float32/64
+    order: ArrayN,  # (M,) int64
     width: int,
     height: int,
-    next_place: ArrayNK,
-    splat_start: ArrayN,
-    hits: ArrayN,
-    places: ArrayN,
+    next_place: ArrayNK,  # (RUNS, tiles) int64
+    splat_start: ArrayN,  # (M + 1,) int64
+    hits: ArrayN,  # (H,) int64
+    places: ArrayN,  # (H,) int64
 ) -> None:
     """List the splats of each tile, nearest first, and the places of each splat in those lists.
 

@@ -20,6 +20,9 @@ from pipelines.splat.rasterizer.reference import depth_slopes, facing_normals, p
 _EVERY_BATCH = 2**31 - 1
 
 
+_Meta = dict[str, Any]  # what gsplat returns beside the image, by its names
+
+
 class CudaRasterizer:
     """Backend of gsplat ≥ 1.5.3. The tensors must be on the CUDA device.
 
@@ -81,9 +84,7 @@ class CudaRasterizer:
         harmonics = self._gsplat.spherical_harmonics(degree, gaussians.means - centre, gaussians.sh)
         return torch.clamp_min(harmonics + 0.5, 0.0)
 
-    def _depth_moments(
-        self, meta: dict[str, Any], slope: Tensor, camera: Pinhole, alpha: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _depth_moments(self, meta: _Meta, slope: Tensor, camera: Pinhole, alpha: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and variance (H, W) of z = z₀ + q · (p − middle of the image), with the weights of blending.
 
         The three numbers of each Gaussian are blended, and their six products that make z². Planes are stated about
@@ -102,7 +103,7 @@ class CudaRasterizer:
         square = (zz + zu * u + zv * v + uu * u * u + uv * u * v + vv * v * v) / total
         return mean, (square - mean.square()).clamp_min(0.0)
 
-    def _blended(self, meta: dict[str, Any], values: Tensor, camera: Pinhole) -> Tensor:
+    def _blended(self, meta: _Meta, values: Tensor, camera: Pinhole) -> Tensor:
         """Return values (M, C) of the visible Gaussians, blended to (H, W, C) with the weights of the render."""
         image, _ = self._gsplat.rasterize_to_pixels(
             meta["means2d"],
@@ -120,7 +121,7 @@ class CudaRasterizer:
         return blended
 
     @torch.no_grad()
-    def _median_depth(self, meta: dict[str, Any], slope: Tensor, camera: Pinhole) -> Tensor:
+    def _median_depth(self, meta: _Meta, slope: Tensor, camera: Pinhole) -> Tensor:
         """Return z (H, W) of the Gaussian at which the transmittance falls to one half, 0 if it stays higher."""
         means_px, conics, opacities = meta["means2d"], meta["conics"], meta["opacities"]
         median = torch.zeros(camera.height * camera.width, device=means_px.device)
@@ -167,7 +168,7 @@ def _row(values: tuple[float, ...], device: torch.device) -> Tensor:
 
 
 def _depth_slope(
-    gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, meta: dict[str, Any], dilation_px2: float
+    gaussians: Gaussians, cam_from_model: Tensor, camera: Pinhole, meta: _Meta, dilation_px2: float
 ) -> Tensor:
     """Return ∂z/∂(u, v) of the M visible Gaussians (M, 2), in m/px."""
     rows, pose = meta["gaussian_ids"].long(), cam_from_model.to(gaussians.means.dtype)
@@ -176,7 +177,7 @@ def _depth_slope(
     return depth_slopes(axes, meta["depths"], dilation_px2)
 
 
-def _screen_stats(meta: dict[str, Any]) -> ScreenStats:
+def _screen_stats(meta: _Meta) -> ScreenStats:
     means_px = meta["means2d"]
     stats = ScreenStats(meta["gaussian_ids"].long())
     if means_px.requires_grad:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +26,7 @@ from pipelines.adjust.state import State, SystematicErrors
 from pipelines.adjust.system import NormalMatrix, Problem, linearised, posterior_weights
 from pipelines.adjust.terms import At, ControlPoints, Fixes, Term
 from pipelines.core.errors import InputError
-from pipelines.core.types import FloatArray, IntArray
+from pipelines.core.types import AutogradContext, FloatArray, IntArray
 from pipelines.geometry.bundle import similarity_modes
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.statistics import root_information
@@ -204,7 +203,7 @@ class _MeanSquares(torch.autograd.Function):
     """Mean squared residuals (T,) of T terms, of the corrections (n, 6) and the similarity (7,) of the whole."""
 
     @staticmethod
-    def forward(ctx: Any, corrections: Tensor, whole: Tensor, at: At, terms: Sequence[Term]) -> Tensor:
+    def forward(ctx: AutogradContext, corrections: Tensor, whole: Tensor, at: At, terms: Sequence[Term]) -> Tensor:
         modes = similarity_modes(at.center)
         by_corrections = np.zeros((len(terms), *corrections.shape))
         values = np.zeros(len(terms))
@@ -219,7 +218,7 @@ class _MeanSquares(torch.autograd.Function):
         return torch.from_numpy(values).to(corrections.device)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None, None]:
+    def backward(ctx: AutogradContext, *gradients: Tensor) -> tuple[Tensor, Tensor, None, None]:
         (gradient,) = gradients
         by_corrections, by_whole = ctx.saved_tensors
         return (gradient[:, None, None] * by_corrections).sum(dim=0), gradient @ by_whole, None, None

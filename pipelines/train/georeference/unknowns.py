@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pipelines.adjust.root import InformationRoot
 from pipelines.adjust.state import State
-from pipelines.core.types import IntArray
+from pipelines.core.types import AutogradContext, IntArray
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.similarity import Similarity, perturbation
 from pipelines.geometry.statistics import CAUCHY_SCALE2
@@ -84,7 +84,7 @@ class _Coloured(torch.autograd.Function):
     """Product L⁻ᵀ v of coordinates (6 n,), at the rows of pivots that follow each other upwards in the factor L."""
 
     @staticmethod
-    def forward(ctx: Any, v: Tensor, pivots: Sequence[TensorPivot]) -> Tensor:
+    def forward(ctx: AutogradContext, v: Tensor, pivots: Sequence[TensorPivot]) -> Tensor:
         ctx.pivots = pivots
         solution = torch.zeros_like(v)
         for pivot in reversed(pivots):
@@ -93,7 +93,7 @@ class _Coloured(torch.autograd.Function):
         return solution
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: AutogradContext, *gradients: Tensor) -> tuple[Tensor, None]:
         (gradient,) = gradients
         solution = gradient.clone()
         for pivot in ctx.pivots:
