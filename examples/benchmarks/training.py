@@ -240,7 +240,7 @@ def presets(arguments: argparse.Namespace) -> None:
         )
 
 
-FIGURES = ("PSNR dB", "H mm", "V mm", "moved mm", "most mm", "whole mm", "surplus")
+FIGURES = ("cpu s", "PSNR dB", "H mm", "V mm", "moved mm", "most mm", "whole mm", "surplus")
 
 
 def georeference(arguments: argparse.Namespace) -> None:
@@ -251,10 +251,12 @@ def georeference(arguments: argparse.Namespace) -> None:
         given = {"preset": "smoke", "iterations": arguments.iterations, "seed": seed, "georeference": form}
         options = TrainOptions.model_validate({**given, "backend": arguments.backend})
         trainer, scene, images = trainer_on(arguments.workspace, options)
+        worked = time.process_time()
         while trainer.iteration < arguments.iterations:
             trainer.step()
+        worked = time.process_time() - worked
         test = ViewQuality(trainer, images).psnr(scene.test)
-        found.setdefault(form, []).append([test, *placed(arguments.workspace, trainer, options)])
+        found.setdefault(form, []).append([worked, test, *placed(arguments.workspace, trainer, options)])
         print(f"{form:12s} {seed:6d}  " + "  ".join(f"{one:10.3f}" for one in found[form][-1]), flush=True)
     for form, runs in found.items():
         for what, of_runs in (("mean", np.mean(runs, axis=0)), ("spread", np.std(runs, axis=0))):
@@ -262,7 +264,7 @@ def georeference(arguments: argparse.Namespace) -> None:
 
 
 def placed(root: Path, trainer: JointTrainer, options: TrainOptions) -> list[float]:
-    """Return `FIGURES` after the first: check points, triangulated, motion of the cameras, χ² of the motion.
+    """Return `FIGURES` after the first two: check points, triangulated, motion of the cameras, χ² of the motion.
 
     H and V are RMSE, NaN without check points. The motion since `init-sim3`, in `geo`, is the root mean square over
     the cameras beside their mean, the largest of all, and that mean. Its χ² is what it costs all measurements.
