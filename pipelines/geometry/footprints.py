@@ -3,6 +3,7 @@
 Also functions for point sets: points by voxel, by square in plan, and rows of dataclasses of arrays.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ _SHALLOWEST = 0.1  # tangent of the angle below the horizon: beyond, a ray ends 
 _NEIGHBOURS = 9  # points whose median is the height of the surface
 _SAMPLES = 32  # along a ray, from the camera down to the lowest point
 _BISECTIONS = 16
+_FOR_ONE_THREAD = 10_000  # coordinates of places: to start several takes longer
 
 
 class PointSurface:
@@ -31,10 +33,19 @@ class PointSurface:
         _, near = self._tree.query(points[:, :2], k=min(_NEIGHBOURS, len(points)), workers=thread_count())
         self._height = np.median(height[np.reshape(near, (len(points), -1))], axis=1)
         self.median, self.lowest = float(np.median(height)), float(height.min())
+        self.highest = float(self._height.max())
 
     def heights(self, places: FloatArray) -> FloatArray:
         """Return the heights (…,) at places (…, 2)."""
-        _, nearest = self._tree.query(places, workers=thread_count())
+        return self.height_of(self.nearest(places))
+
+    def nearest(self, places: FloatArray) -> IntArray:
+        """Return the points (…,), as rows, that give places (…, 2) their heights."""
+        workers = thread_count() if places.size > _FOR_ONE_THREAD else 1
+        return np.asarray(self._tree.query(places, workers=workers)[1], dtype=np.int64)
+
+    def height_of(self, nearest: IntArray) -> FloatArray:
+        """Return the heights (…,) of places whose nearest points are (…,)."""
         return np.asarray(self._height[nearest])
 
 
@@ -105,22 +116,36 @@ def _below_horizon(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _depths(ray: FloatArray, center: FloatArray, surface: PointSurface) -> FloatArray:
-    """Return how far (K,) below the centre rays (K, 3), which descend by one, first pass below the surface."""
+    """Return how far (K,) below the centre rays (K, 3), which descend by one, first pass below the surface.
 
-    def above(depth: FloatArray) -> FloatArray:
-        places = center[:2] + depth[..., None] * ray[:, :2]
-        return np.asarray(center[2] - depth - surface.heights(places))
-
-    depth = np.linspace(0.0, center[2] - surface.lowest, _SAMPLES)
-    free = above(np.repeat(depth[:, None], len(ray), axis=1)) > 0
-    passes = free[:-1] & ~free[1:]
-    first = passes.argmax(axis=0)
-    low, high = depth[first], depth[first + 1]
+    The surface is level around each of its points, in a convex cell of the plan. Where a part of a ray begins and
+    ends in one cell, no point needs to be looked for in between.
+    """
+    count = len(ray)
+    steps = np.linspace(0.0, center[2] - surface.lowest, _SAMPLES)
+    above, open_ = np.full(count, center[2] > surface.heights(center[:2])), np.arange(count)
+    low, high = np.zeros(count), np.full(count, np.nan)  # of the part in which a ray passes below
+    at_low, at_high = np.full(count, -1), np.full(count, -1)  # points below its ends; -1: not looked for
+    for before, depth in itertools.pairwise(steps.tolist()):
+        if center[2] - depth > surface.highest:
+            above[:], at_low[:] = True, -1
+            continue
+        at = surface.nearest(center[:2] + depth * ray[open_, :2])
+        is_above = center[2] - depth - surface.height_of(at) > 0
+        passes = above[open_] & ~is_above
+        rows, rest = open_[passes], open_[~passes]
+        low[rows], high[rows], at_high[rows] = before, depth, at[passes]
+        above[rest], at_low[rest] = is_above[~passes], at[~passes]
+        open_ = rest
+    rows = np.flatnonzero(np.isfinite(high))
     for _ in range(_BISECTIONS):
-        middle = (low + high) / 2
-        is_free = above(middle) > 0
-        low, high = np.where(is_free, middle, low), np.where(is_free, high, middle)
-    return np.asarray(np.where(passes.any(axis=0), high, center[2] - surface.median))
+        middle, at = (low[rows] + high[rows]) / 2, at_low[rows]
+        apart = at != at_high[rows]
+        at[apart] = surface.nearest(center[:2] + middle[apart, None] * ray[rows[apart], :2])
+        is_above = center[2] - middle - surface.height_of(at) > 0
+        for is_end, end, at_end in ((is_above, low, at_low), (~is_above, high, at_high)):
+            end[rows[is_end]], at_end[rows[is_end]] = middle[is_end], at[is_end]
+    return np.where(np.isfinite(high), high, center[2] - surface.median)
 
 
 def clipped_ring(ring: FloatArray, inside: FloatArray) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.geometry.cameras import Camera
-from pipelines.geometry.footprints import PointSurface, border_rays, clipped_ring, footprint
+from pipelines.geometry.footprints import PointSurface, border_rays, clipped_ring, footprint, ground_points
 from pipelines.geometry.rotations import geo_from_cam
 
 LENS = Camera("PINHOLE", 400, 300, np.array([200.0, 200.0, 200.0, 150.0]))
@@ -112,3 +112,32 @@ def test_ring_and_its_complement_share_the_area(radii: list[float], border: floa
     assert (right[:, 0] >= border - 1e-9).all()
     whole = sum(area(part) for part in (left, right) if len(part))
     assert whole == pytest.approx(area(ring), abs=1e-9)
+
+
+def first_below(ray: np.ndarray, center: np.ndarray, surface: PointSurface) -> np.ndarray:
+    """Return where a ray meets the surface: 32 samples, then 16 halvings, and no shortcut."""
+    ray = ray / -ray[2]
+
+    def is_above(depth: float) -> bool:
+        return bool(center[2] - depth - surface.heights(center[:2] + depth * ray[:2]) > 0)
+
+    steps = np.linspace(0.0, center[2] - surface.lowest, 32).tolist()
+    for above, below in pairwise(steps):
+        if is_above(above) and not is_above(below):
+            low, high = above, below
+            for _ in range(16):
+                middle = (low + high) / 2
+                low, high = (middle, high) if is_above(middle) else (low, middle)
+            return np.asarray(center + high * ray)
+    return np.asarray(center + (center[2] - surface.median) * ray)
+
+
+@pytest.mark.parametrize("height", [7.0, 14.0, 60.0])
+def test_rays_end_where_a_plain_search_ends_them(height: float) -> None:
+    random = np.random.default_rng(int(height))
+    place = random.uniform(-60, 60, (400, 2))
+    town = PointSurface(np.column_stack([place, random.choice([0.0, 5.0, 12.0], 400)]))
+    rays = random.normal(size=(200, 3)) * [1, 1, 0.5] - [0, 0, 1.5]
+    rays, center = rays[rays[:, 2] < -0.3], np.array([4.0, -9.0, height])
+    expected = [first_below(ray / np.linalg.norm(ray), center, town) for ray in rays]
+    np.testing.assert_allclose(ground_points(rays, center, town), expected, atol=1e-9)
