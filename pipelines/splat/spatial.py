@@ -16,6 +16,7 @@ from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu_gaussian import WIDEST
 from pipelines.splat.rasterizer.reference import FRUSTUM_MARGIN
+from pipelines.splat.sh import coefficient_count
 
 BITS = 21  # three coordinates of 21 bits fill the 63 bits of a positive int64
 
@@ -75,13 +76,14 @@ class SpatialBlocks:
 
     def in_view(self, cam_from_model: FloatArray, camera: Pinhole, settings: RasterSettings) -> Gaussians:
         """Return few Gaussians, in their order: all that a render of the whole image, or of the settings' window,
-        can show.
+        can show, with the harmonics of the settings' degree alone.
         """
         blocks = self._blocks_in(cam_from_model, camera, settings)
         chosen = blocks[:, None] * _BLOCK + np.arange(_BLOCK)
         rows = np.sort(self._row[chosen[chosen < self._count]])
+        values = self._values | {"sh": self._values["sh"][:, : coefficient_count(settings.sh_degree)]}
         # By numpy: torch would wake all its threads for a few thousand rows.
-        return Gaussians(**{name: torch.from_numpy(values[rows]) for name, values in self._values.items()})
+        return Gaussians(**{name: torch.from_numpy(array[rows]) for name, array in values.items()})
 
     def count_shown(self, cam_from_model: FloatArray, camera: Pinhole, settings: RasterSettings) -> int:
         """Return how many Gaussians `shown` returns, but for the last block's, without gathering them."""

@@ -72,10 +72,11 @@ def heights_in_plan(
     levels = level_m + np.array([0.0, -1.0, 1.0]) * max(_RELIEF_M, _RELIEF * extent_m)
     reads = _readers(renderer, np.column_stack([plan, np.full(len(plan), level_m)]), most_views)
     by_use = [int(camera) for camera in np.argsort(-reads.sum(axis=0), kind="stable") if reads[:, camera].any()]
-    tree, count = cKDTree(plan), len(renderer.sparse.image_name)
+    tree, around, count = cKDTree(plan), _Around(plan, reach_m), len(renderer.sparse.image_name)
     height = np.full((len(plan), count), np.nan)
     for number, camera in enumerate(by_use):
         points = _seen_points(renderer, camera, plan[reads[:, camera]], levels, reach_m)
+        points = points[around.holds(points)]
         if len(points):
             distance, place = tree.query(points[:, :2], distance_upper_bound=reach_m)
             near = np.isfinite(distance)
@@ -86,6 +87,29 @@ def heights_in_plan(
             height[:, camera] = np.where(reads[:, camera], mean, np.nan)
         advance((number + 1) / len(by_use))
     return _agreed(renderer, plan, height)
+
+
+_MOST_CELLS = 2048  # along an axis
+
+
+class _Around:
+    """Cells of the plan around places (N, 2): of the pixels of whole views, few are within reach of one."""
+
+    def __init__(self, plan: FloatArray, reach_m: float) -> None:
+        low, high = plan.min(axis=0), plan.max(axis=0)
+        self._cell_m = max(reach_m, float((high - low).max()) / _MOST_CELLS)
+        self._low = low - 2 * self._cell_m
+        cell = np.floor((plan - self._low) / self._cell_m).astype(np.int64)
+        self._near = np.zeros(cell.max(axis=0) + 3, dtype=bool)
+        for east, north in np.ndindex(3, 3):
+            self._near[cell[:, 0] + east - 1, cell[:, 1] + north - 1] = True
+
+    def holds(self, points: FloatArray) -> BoolArray:
+        """Return which of points (P, 2 or 3) may lie within reach of a place: all that do, and a few more."""
+        cell = np.floor((points[:, :2] - self._low) / self._cell_m)
+        inside = ((cell >= 0) & (cell < self._near.shape)).all(axis=1)
+        east, north = np.where(inside[:, None], cell, 0).astype(np.int64).T
+        return np.asarray(inside & self._near[east, north])
 
 
 def _readers(renderer: ModelRenderer, points: FloatArray, most_views: int) -> BoolArray:

@@ -99,11 +99,17 @@ class ModelRenderer:
         poses = self.poses
         return ViewPose(self.pinholes.of(index), poses.cam_from_model[index], poses.cam_center_in_model[index])
 
-    def render(self, view: int | ViewPose, *, depth: bool = False, window: Window | None = None) -> Render:
-        """Return the render of a camera, by its index or from anywhere, or of a window of it, without gradients."""
+    def render(
+        self, view: int | ViewPose, *, depth: bool = False, window: Window | None = None, plain: bool = False
+    ) -> Render:
+        """Return the render of a camera, by its index or from anywhere, or of a window of it, without gradients.
+
+        In `plain` colours, the same from all sides, it takes less time.
+        """
         model, pose = self.model, view if isinstance(view, ViewPose) else self.pose(view)
         matrix = pose_matrix(pose.cam_from_model, pose.center_in_model)
-        settings = RasterSettings(model.sh_degree, model.background, depth=depth, window=window)
+        degree = 0 if plain else model.sh_degree
+        settings = RasterSettings(degree, model.background, depth=depth, window=window)
         gaussians = self._on_device
         if window is not None:  # A pass over millions of Gaussians takes longer than the window itself.
             gaussians = self.blocks.in_view(matrix, pose.pinhole, settings).to(gaussians.means.device)
@@ -113,7 +119,8 @@ class ModelRenderer:
 
     def depth_m(self, view: int | ViewPose, window: Window | None = None) -> FloatArray:
         """Return the depth (H, W) in metres of the surface along the z axis of a camera; 0: no surface."""
-        return np.asarray(measured_depth(self.render(view, depth=True, window=window)).cpu().numpy())
+        seen = self.render(view, depth=True, window=window, plain=True)
+        return np.asarray(measured_depth(seen).cpu().numpy())
 
     def key(self) -> str:
         """Return a hash of all that the surface in the training views depends on; errors as of `ImageCache.key`."""
