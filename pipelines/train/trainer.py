@@ -143,7 +143,7 @@ class JointTrainer:
         view = self._rendered(
             self._targets.get(self._image_look(self.iteration), self._image_look(self.iteration + 1))
         )
-        self._unknowns.adam.zero_grad()
+        self._unknowns.clear()
         total, values = weighted_sum(self._losses, view, self.iteration)
         total.backward()
         losses = {name: value.detach() for name, value in values.items()}

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.root import information_root
@@ -395,12 +396,19 @@ _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 class GeographicAdam:
-    """Adam for what all views share: the coordinates of the unknowns, in units of their σ."""
+    """Adam for what all views share: the coordinates of the unknowns, in units of their σ.
+
+    By torch's function: its class loads torch's compiler, for two seconds.
+    """
 
     def __init__(self, problem: GeoProblem, options: JointOptions, device: torch.device) -> None:
         self._w, self._rate, self._device = problem.unknowns.w, options.solution_rate, device
-        # One kernel for the short vector on a GPU, in place of a dozen whose launches take longer than their work.
-        self.adam = torch.optim.Adam([self._w], fused=device.type == "cuda")
+        self._moments = {name: torch.zeros_like(self._w) for name in _MOMENTS}
+        self._moments["step"] = torch.zeros((), device=device)
+
+    def clear(self) -> None:
+        """Forget the gradients."""
+        self._w.grad = None
 
     def named(self) -> dict[str, Tensor]:
         """Return the unknowns by what they are called in messages."""
@@ -408,19 +416,24 @@ class GeographicAdam:
 
     def step(self, factor: float) -> None:
         """Move all unknowns by their gradients, at their rate times `factor`."""
-        for group in self.adam.param_groups:
-            group["lr"] = factor * self._rate
-        self.adam.step()
+        if self._w.grad is None:
+            return
+        step, average, square = (self._moments[name] for name in _MOMENTS)
+        # One kernel for the short vector on a GPU, in place of a dozen whose launches take longer than their work.
+        fused = self._device.type == "cuda"
+        with torch.no_grad():
+            adam(
+                [self._w], [self._w.grad], [average], [square], [], [step],
+                foreach=False, fused=fused, amsgrad=False, beta1=0.9, beta2=0.999, lr=factor * self._rate,
+                weight_decay=0.0, eps=1e-8, maximize=False,
+            )  # fmt: skip
 
     def state(self) -> dict[str, Tensor]:
         """Return unknowns and moments by name, for a checkpoint."""
-        moments = self.adam.state[self._w].items()
-        return {"w": self._w, **{f"w_{key}": torch.as_tensor(value) for key, value in moments}}
+        return {"w": self._w, **{f"w_{name}": values for name, values in self._moments.items()}}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         with torch.no_grad():
             self._w.copy_(state["w"])
-        # A fused Adam keeps its count of steps on the device.
-        self.adam.state[self._w] = {
-            key: state[f"w_{key}"].to(self._device) for key in _MOMENTS if f"w_{key}" in state
-        }
+            for name, values in self._moments.items():
+                values.copy_(state.get(f"w_{name}", torch.zeros_like(values)))
