@@ -22,7 +22,6 @@ from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import special
 
 from pipelines.core.errors import DegenerateGeometryError
 from pipelines.core.products import Product
@@ -64,16 +63,20 @@ _WEISZFELD_NEAR = 1e-6  # lower limit of a distance, so that a point at the medi
 
 def chi2_quantile(probability: float, degrees: ArrayLike) -> FloatArray:
     """Return the quantile of χ² with `degrees` (…) of freedom; 0 for zero degrees."""
+    # scipy.stats, which says the same by name, takes a second to load; nor must an import of the types below wait.
+    from scipy.special import gammaincinv
+
     dof = np.asarray(degrees)
     distinct, place = np.unique(dof, return_inverse=True)
-    # scipy.stats, which says the same by name, takes a second to load.
-    values = np.where(distinct > 0, 2.0 * special.gammaincinv(np.maximum(distinct, 1) / 2.0, probability), 0.0)
+    values = np.where(distinct > 0, 2.0 * gammaincinv(np.maximum(distinct, 1) / 2.0, probability), 0.0)
     return np.asarray(values[place].reshape(dof.shape), dtype=np.float64)
 
 
 def chi2_probability_above(value: float, degrees: float) -> float:
     """Return the probability that χ² with `degrees` of freedom, a real number, exceeds `value`."""
-    return float(special.chdtrc(degrees, value))
+    from scipy.special import chdtrc
+
+    return float(chdtrc(degrees, value))
 
 
 @cache
