@@ -175,7 +175,7 @@ def write_csv(grid: AccuracyGrid, origin: Origin | None, path: Path) -> None:
         geodetic = [[f"{lat:.8f}", f"{lon:.8f}", f"{height:.3f}"] for lat, lon, height in lla]
     values = np.column_stack([grid.sigma_m, grid.sigma_h_m, grid.sigma_v_m])
     rows = (
-        [f"{value:.3f}" for value in place] + on_ellipsoid + [f"{value:.5f}" for value in sigma]
-        for place, on_ellipsoid, sigma in zip(grid.position_in_geo, geodetic, values, strict=True)
+        [f"{value:.3f}" for value in position] + on_ellipsoid + [f"{value:.5f}" for value in sigma]
+        for position, on_ellipsoid, sigma in zip(grid.position_in_geo, geodetic, values, strict=True)
     )
     replace_text(path, table_text(itertools.chain([_PLACE + _SIGMA], rows)))

@@ -84,8 +84,8 @@ def calibrate(
         fit = rig_fit.fit_rig(data, start_s, track.nominal_from_cam, free)
     except DegenerateGeometryError as error:
         return RigCalibration(wanted=wanted, problem=error.fault, remedy=error.remedy)
-    found = _estimates(fit, track)
-    estimates = [found[name] for name in wanted]
+    estimated = _estimates(fit, track)
+    estimates = [estimated[name] for name in wanted]
     applied = tuple(estimate for estimate in estimates if options.apply and all(estimate.observable))
     attitude = fit.rms_attitude_deg
     return RigCalibration(
@@ -186,7 +186,9 @@ def _estimates(fit: rig_fit.RigFit, track: NavigationTrack) -> dict[RigParameter
     offset_seen = sigma_s <= rig_fit.LIMIT_OFFSET_S
     boresight_seen = is_observed("boresight", fit.sigma[rig_fit.BORESIGHT], SIGMA_BORESIGHT_RAD)
     arm_seen = is_observed("lever-arm", sigma_m, SIGMA_ARM_M)
-    found: dict[RigParameter, tuple[Literal["s", "deg", "m"], BoolArray, FloatArray, FloatArray, FloatArray]] = {
+    quantities: dict[
+        RigParameter, tuple[Literal["s", "deg", "m"], BoolArray, FloatArray, FloatArray, FloatArray]
+    ] = {
         "time-offset": ("s", offset_seen, value_s, sigma_s, start_s),
         "boresight": ("deg", boresight_seen, value_deg, sigma_deg, start_deg),
         "lever-arm": ("m", arm_seen, start_m + fit.state.arm, sigma_m, start_m),
@@ -200,7 +202,7 @@ def _estimates(fit: rig_fit.RigFit, track: NavigationTrack) -> dict[RigParameter
             start=tuple(start.astype(float).tolist()),
             observable=tuple(seen.tolist()),
         )
-        for name, (unit, seen, value, sigma, start) in found.items()
+        for name, (unit, seen, value, sigma, start) in quantities.items()
     }
 
 

@@ -45,8 +45,10 @@ def common_similarity(
     def squares(similarity: Similarity) -> FloatArray:
         return np.asarray(((similarity.apply(local) - in_geo) ** 2).sum(axis=1) / tolerance**2)
 
-    found = ransac(len(local), lambda rows: umeyama(local[rows], in_geo[rows]), squares, RansacOptions(3, 1.0), rng)
-    similarity = found.model
+    consensus = ransac(
+        len(local), lambda rows: umeyama(local[rows], in_geo[rows]), squares, RansacOptions(3, 1.0), rng
+    )
+    similarity = consensus.model
     for _ in range(_STEPS):
         near = squares(similarity) <= 1.0
         if near.sum() < 3:
@@ -83,9 +85,9 @@ def outliers_in_common(near: Linearised, consistency: Consistency) -> tuple[int,
     if not isinstance(term, EarlierPoints):
         return ()
     used = consistency.used[term.kind].copy()
-    place = term.position_in_geo[:, :2]
-    side = max(float(np.ptp(place, axis=0).max()) / _BLOCKS, 1e-6)
-    blocks = np.unique(np.floor((place - place.min(axis=0)) / side), axis=0, return_inverse=True)[1].reshape(-1)
+    plan = term.position_in_geo[:, :2]
+    side = max(float(np.ptp(plan, axis=0).max()) / _BLOCKS, 1e-6)
+    blocks = np.unique(np.floor((plan - plan.min(axis=0)) / side), axis=0, return_inverse=True)[1].reshape(-1)
     count = np.bincount(blocks)
     moved = (np.bincount(blocks, ~used) > count / 2) & (count >= _LEAST_IN_BLOCK)
     used[moved[blocks]] = False
@@ -98,28 +100,28 @@ def cautions_of_common(survey: Survey, near: Linearised, consistency: Consistenc
     if common is None or not isinstance(term, EarlierPoints):
         return ()
     outliers = [str(name) for name in outliers_in_common(near, consistency)]
-    used, found = ~np.isin(term.name, outliers), []
+    used, cautions = ~np.isin(term.name, outliers), []
     count, spread = int(used.sum()), float(common.spread)
     if count < FEW_COMMON:
         sentence = f"{count} points tie this date to {common.name}, where {FEW_COMMON} are enough for its shape."
         remedy = "Give sfm a larger --max-features."
-        found.append(Remark(code="few-common-points", sentence=sentence, remedy=remedy))
+        cautions.append(Remark(code="few-common-points", sentence=sentence, remedy=remedy))
     if spread < NARROW_SPREAD:
         sentence = (
             f"The points in common with {common.name} cover {spread:.0%} of the ground that both dates show: the "
             "difference of both is known there, and less beyond it."
         )
-        found.append(Remark(code="common-points-in-a-corner", sentence=sentence))
+        cautions.append(Remark(code="common-points-in-a-corner", sentence=sentence))
     if float((~used).mean()) > _DISAGREE:
         sentence = (
             f"{int((~used).sum())} of {len(used)} points in common with {common.name} disagree with the others: "
             "much of the ground has moved."
         )
-        found.append(Remark(code="common-points-disagree", sentence=sentence))
+        cautions.append(Remark(code="common-points-disagree", sentence=sentence))
     if not bool(common.checked):
         sentence = f"The places are those of {common.name}, of which nothing checks the stated σ."
-        found.append(Remark(code=NOT_CHECKED, sentence=sentence))
-    return (*found, *_of_place(consistency, common.name))
+        cautions.append(Remark(code=NOT_CHECKED, sentence=sentence))
+    return (*cautions, *_of_place(consistency, common.name))
 
 
 def _of_place(consistency: Consistency, name: str) -> tuple[Remark, ...]:

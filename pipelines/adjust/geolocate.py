@@ -136,14 +136,14 @@ def _without_positions(model: SparseModel, why: str, remedy: str = "") -> Geoloc
     return Geolocation(points, np.full(count, np.nan), why, (warning,))
 
 
-def _points(model: SparseModel, found: Intersections, inlier: BoolArray, source: str) -> GeolocatedPoints:
+def _points(model: SparseModel, intersections: Intersections, inlier: BoolArray, source: str) -> GeolocatedPoints:
     return GeolocatedPoints(
         point_id=model.point_id,
-        position_in_geo=found.position_in_geo,
-        cov_in_geo=found.cov_in_geo,
-        ray_count=found.ray_count,
-        max_angle_deg=found.max_angle_deg,
-        condition=found.condition,
+        position_in_geo=intersections.position_in_geo,
+        cov_in_geo=intersections.cov_in_geo,
+        ray_count=intersections.ray_count,
+        max_angle_deg=intersections.max_angle_deg,
+        condition=intersections.condition,
         inlier=inlier,
         rotation_source=source,
     )

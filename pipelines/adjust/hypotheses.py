@@ -157,8 +157,8 @@ def clock_that_turns(fixes: StatedFixes, attitude: RotationPrior) -> tuple[float
         similarity, scatter, _ = track.at(offset_s)
         return turn_against(attitude, similarity) + (0.0 if scatter < limit else np.pi)
 
-    found = min(_minima(turn, track.offsets(_TURN_S)), key=lambda one: one[1], default=None)
-    return None if found is None or found[1] > np.pi else found
+    best = min(_minima(turn, track.offsets(_TURN_S)), key=lambda one: one[1], default=None)
+    return None if best is None or best[1] > np.pi else best
 
 
 def _plain(fixes: StatedFixes) -> tuple[Similarity, Hypothesis]:
@@ -223,8 +223,8 @@ def _latitude_for_longitude(position: FloatArray, origin: Origin) -> FloatArray:
     exchanged = lla[:, [1, 0, 2]] - lla[:, [1, 0, 2]].mean(axis=0) + middle
     if np.abs(exchanged[:, 0]).max() > 89.0:
         return position
-    place = Origin(lat_deg=float(middle[0]), lon_deg=float(middle[1]), alt_m=origin.alt_m)
-    return enu_from_ecef(ecef_from_lla(exchanged), place)
+    exchanged_origin = Origin(lat_deg=float(middle[0]), lon_deg=float(middle[1]), alt_m=origin.alt_m)
+    return enu_from_ecef(ecef_from_lla(exchanged), exchanged_origin)
 
 
 def _drifts(fixes: StatedFixes, price: float) -> Iterator[_Change]:
@@ -256,10 +256,10 @@ def _groups(fixes: StatedFixes, start: Similarity, price: float) -> Iterator[_Ch
     count, similarity = len(fixes.name), start
     second = np.zeros(count, dtype=bool)
     for _ in range(_ROUNDS):
-        found = statistics.two_groups(fixes.position_in_geo - similarity.apply(fixes.center_in_local))
-        if found is None or np.array_equal(found.second, second):
+        groups = statistics.two_groups(fixes.position_in_geo - similarity.apply(fixes.center_in_local))
+        if groups is None or np.array_equal(groups.second, second):
             break
-        second = found.second
+        second = groups.second
         changed, apart = _without(fixes, second.astype(np.float64))
         similarity = fit(fixes.center_in_local, changed)[0]
     if not second.any():

@@ -139,7 +139,9 @@ def cautions_of(
         *_weak_checks(weighted, near.problem, factors),
         *_assumed_sigmas(weighted, factors),
     ]
-    ending, others = (tuple(found.remark for found in findings if found.ends == ends) for ends in (True, False))
+    ending, others = (
+        tuple(finding.remark for finding in findings if finding.ends == ends) for ends in (True, False)
+    )
     return ending, others
 
 

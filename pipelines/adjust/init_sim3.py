@@ -238,10 +238,10 @@ def robust_similarity(
     initial, verdict, more = _joint_product(points, (aligned, verdict), scene, near, consistency)
     of_earlier = cautions_of_common(survey, near, consistency)
     cautions = union(survey.cautions, inconsistencies, of_marks, of_arm, of_lens, limits, of_earlier)
-    told = {caution.code for caution in cautions}
+    codes = {caution.code for caution in cautions}
     verdict = verdict.model_copy(update={"cautions": cautions})
     posterior = solved(survey, model, initial, verdict, estimate=mount, joint=(scene, near))
-    return posterior, warnings + tuple(one for one in more if one.code not in told)
+    return posterior, warnings + tuple(one for one in more if one.code not in codes)
 
 
 def similarity_by_distances(

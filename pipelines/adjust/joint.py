@@ -106,20 +106,20 @@ def adjust_jointly(
         DegenerateGeometryError: the measurements leave the similarity open, from every start.
         InputError: an error is to be estimated whose measurements were not recorded.
     """
-    found: list[_Found] = []
+    attempts: list[_Found] = []
     refusal = DegenerateGeometryError("no-start", "The joint adjustment has no start.")
     frame: Scene | None = None
     for start in starts:
         try:
             frame = initial_scene(model, survey, start.initial) if frame is None else frame
-            found.append(_adjust(survey, frame, start, estimate))
-            if found[0].consistent:
+            attempts.append(_adjust(survey, frame, start, estimate))
+            if attempts[0].consistent:
                 break
         except (DegenerateGeometryError, ConvergenceError) as error:
             refusal = DegenerateGeometryError(error.code, error.fault, remedy=error.remedy)
-    if frame is None or not found:
+    if frame is None or not attempts:
         raise refusal
-    best = min(found, key=lambda one: one.cost)
+    best = min(attempts, key=lambda one: one.cost)
     return frame, best.near, best.consistency
 
 

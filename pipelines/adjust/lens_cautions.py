@@ -33,12 +33,12 @@ def focal_length_of(survey: Survey, model: SparseModel) -> tuple[Remark, ...]:
     """
     prior_of = {camera.camera_id: camera for camera in survey.cameras}
     camera_of = {image.name: image.camera_id for image in survey.images}
-    found = {}
+    changed = {}
     for image, name in enumerate(model.image_name):
         prior, solved = prior_of[camera_of[name]], model.camera_of(image)
         if prior.focal_factor(solved) > FOCAL_DIFFERS:
-            found[prior.make_model.strip() or f"camera {prior.camera_id}"] = prior, solved
-    cautions = tuple(_apart(camera, prior, solved) for camera, (prior, solved) in found.items())
+            changed[prior.make_model.strip() or f"camera {prior.camera_id}"] = prior, solved
+    cautions = tuple(_apart(camera, prior, solved) for camera, (prior, solved) in changed.items())
     unchecked = Remark(
         code=NOT_CHECKED, sentence="No accuracy is stated: σ describe errors of a model, not a model that is bent."
     )
@@ -90,9 +90,13 @@ def rolling_shutter_of(
     known = np.repeat(np.isfinite(shift).all(axis=1), 2)
     if known.sum() < 2 * _LEAST_IMAGES:
         return ()
-    unit, told = shift.ravel()[known], motion.motion_px.ravel()[known]
+    unit, predicted = shift.ravel()[known], motion.motion_px.ravel()[known]
     information = motion.information[np.ix_(known, known)]
-    own, cross, size = unit @ information @ unit, unit @ information @ told, told @ information @ told
+    own, cross, size = (
+        unit @ information @ unit,
+        unit @ information @ predicted,
+        predicted @ information @ predicted,
+    )
     if cross <= 0 or cross**2 < _EXPLAINED * own * size:
         return ()
     readout = float(cross / own)

@@ -66,9 +66,9 @@ def level_of(survey: Survey, model: SparseModel, recorded: RotationPrior | None)
     time_s = {image.name: image.timestamp_s for image in survey.images}
     known = [time_s.get(name) for name in model.image_name]
     order = np.argsort([np.nan if one is None else one for one in known] if None not in known else model.image_name)
-    found = level_by_views(model.rotation_cam_from_local[order], model.image_camera_id[order])
-    found = _with_ground(found, ground_normal(model, found.up_in_local))
-    return found if found.sigma_rad < _WORST else None
+    level = level_by_views(model.rotation_cam_from_local[order], model.image_camera_id[order])
+    level = _with_ground(level, ground_normal(model, level.up_in_local))
+    return level if level.sigma_rad < _WORST else None
 
 
 def ground_normal(model: SparseModel, up_in_local: FloatArray) -> FloatArray | None:

@@ -65,9 +65,9 @@ def _scale(survey: Survey, model: SparseModel) -> float:
     wanted = [distance for distance in survey.distances if distance.use == "control"]
     rays = mark_rays([end for distance in wanted for end in distance.ends], model)
     marked = rays.marks_of_point >= 2
-    place = np.full((len(marked), 3), np.nan)
-    place[marked] = intersect_in_local(model, rays.of_points(marked))[0]
-    length = np.linalg.norm(place[::2] - place[1::2], axis=1)
+    point = np.full((len(marked), 3), np.nan)
+    point[marked] = intersect_in_local(model, rays.of_points(marked))[0]
+    length = np.linalg.norm(point[::2] - point[1::2], axis=1)
     known = np.isfinite(length) & (length > 0)
     if not known.any():
         names = listed([distance.name for distance in wanted])

@@ -433,9 +433,9 @@ def distances_of(scene: Scene, survey: Survey) -> Distances | None:
         np.zeros(0),
         np.tile(np.eye(3), (len(scene.poses.cam_from_model), 1, 1)),
     )
-    place = exact.places(sfm)
-    _, along = exact.compared(place)
-    of_marks = _mark_covariance(scene, rays, place).reshape(-1, 2, 3, 3).sum(axis=1)
+    ends = exact.places(sfm)
+    _, along = exact.compared(ends)
+    of_marks = _mark_covariance(scene, rays, ends).reshape(-1, 2, 3, 3).sum(axis=1)
     variance = np.einsum("di,dij,dj->d", along, of_marks, along)
     variance += np.array([distance.sigma_m for distance in wanted]) ** 2
     return replace(exact, cov=variance[:, None, None])

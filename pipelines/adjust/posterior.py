@@ -300,7 +300,7 @@ def load_posterior(path: Path, solution: Solution, sfm: SparseModel) -> Posterio
         and followed.shape == (7, 6 * n + known)
         and camera_cov.shape == (n, 6, 6)
         and lens.ndim == 1
-        and all(0 <= place < known for place in lens.tolist())
+        and all(0 <= index < known for index in lens.tolist())
         and len(lens) <= width
         and arrays["data"].shape == (len(arrays["indices"]), 6, 6)
         and arrays["indptr"].shape == (n + 1,)

@@ -58,8 +58,8 @@ class Solved:
     def tracks(self, point_id: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
         """Return the places (J, 3) in geo of points by COLMAP's ids, and point and camera (K,) of their tracks."""
         part = points_of_network(self.network, np.searchsorted(self.posterior.sparse.point_id, point_id))
-        place = self.posterior.solution.similarity.apply(refined_points(part).point_in_world)
-        return place, part.obs_point, part.obs_image
+        point_in_geo = self.posterior.solution.similarity.apply(refined_points(part).point_in_world)
+        return point_in_geo, part.obs_point, part.obs_image
 
     @property
     def sigma_m(self) -> FloatArray:
@@ -82,10 +82,10 @@ class Solved:
 
         The covariances are those of the points' own marks; NaN: they do not determine a point.
         """
-        place, point, camera = self.tracks(point_id)
-        _, _, cov = self.posterior.derivatives(place, point, camera, of_tracks=True)
+        point_in_geo, point, camera = self.tracks(point_id)
+        _, _, cov = self.posterior.derivatives(point_in_geo, point, camera, of_tracks=True)
         axes = ecef_from_enu_rotation(lla_of(self.origin))
-        return ecef_from_enu(place, self.origin), np.asarray(axes @ cov @ axes.T)
+        return ecef_from_enu(point_in_geo, self.origin), np.asarray(axes @ cov @ axes.T)
 
 
 @dataclass(frozen=True)
@@ -119,14 +119,14 @@ def relative(later: Solved, earlier: Solved, common: CommonPoints) -> Relative:
         remedy = "Run `georef run` of the later date again."
         raise InputError("common-points-stale", message, remedy=remedy)
     known = np.isin(common.point_id, later.posterior.sparse.point_id)
-    place, *_ = later.tracks(common.point_id[known])
-    missed = place - common.position_in_geo(later.origin)[known]
+    point_in_geo, *_ = later.tracks(common.point_id[known])
+    missed = point_in_geo - common.position_in_geo(later.origin)[known]
     order = np.argsort(common.point_id)
     row = order[np.searchsorted(common.point_id, tied.point_id, sorter=order)]
     axes = _turn(later.origin, earlier.origin)
     tie = _Tie(later, earlier, tied, axes, _moved_by_earlier(earlier, common.earlier_point_id[row], axes))
     grid = accuracy_grid(later.posterior.sparse, later.point_in_geo, tie.covariance)
-    return Relative(place, np.isin(common.point_id[known], tied.point_id), missed, grid)
+    return Relative(point_in_geo, np.isin(common.point_id[known], tied.point_id), missed, grid)
 
 
 def _finite(matrix: csr_matrix) -> csr_matrix:
@@ -135,9 +135,9 @@ def _finite(matrix: csr_matrix) -> csr_matrix:
 
 def _moved_by_earlier(earlier: Solved, point_id: IntArray, axes: FloatArray) -> csr_matrix:
     """Return the derivative (3 J, 6 n + b) of the common points, along the later axes, by the earlier unknowns."""
-    place, point, camera = earlier.tracks(point_id)
-    by_poses, by_border, _ = earlier.posterior.derivatives(place, point, camera, of_tracks=True)
-    turned = kron(identity(len(place)), axes, format="csr")
+    point_in_geo, point, camera = earlier.tracks(point_id)
+    by_poses, by_border, _ = earlier.posterior.derivatives(point_in_geo, point, camera, of_tracks=True)
+    turned = kron(identity(len(point_in_geo)), axes, format="csr")
     return _finite(csr_matrix(turned @ hstack([by_poses, csr_matrix(by_border)])))
 
 
@@ -162,13 +162,13 @@ class _Tie:
             cov[rows] = self._of_part(point_in_geo[rows], point[chosen] - first, camera[chosen])
         return cov
 
-    def _of_part(self, place: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
+    def _of_part(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         normal = self.later.posterior.normal
-        by_poses, by_border, _ = self.later.posterior.derivatives(place, point, camera)
+        by_poses, by_border, _ = self.later.posterior.derivatives(point_in_geo, point, camera)
         own = normal.covariances(by_poses, by_border, 3)
         poses, border = normal.solve(by_poses.T.toarray(), by_border.T)
         response = (self.common.by_poses @ poses + self.common.by_border @ border).T  # J₂ N₂⁻¹ Aᵀ W
-        there = self._at_earlier(place)
+        there = self._at_earlier(point_in_geo)
         follows = response @ self.moved - there
         count = self.earlier.posterior.normal.poses.shape[0]
         of_earlier = self.earlier.posterior.normal.covariances(
@@ -176,14 +176,14 @@ class _Tie:
         )
         return own + of_earlier
 
-    def _at_earlier(self, place: FloatArray) -> FloatArray:
+    def _at_earlier(self, point_in_geo: FloatArray) -> FloatArray:
         """Return the derivative (3 C, 6 n' + b') of the earlier places, along the later axes."""
-        in_earlier = enu_from_ecef(ecef_from_enu(place, self.later.origin), self.earlier.origin)
+        in_earlier = enu_from_ecef(ecef_from_enu(point_in_geo, self.later.origin), self.earlier.origin)
         sparse, posterior = self.earlier.posterior.sparse, self.earlier.posterior
         near = self._tree.query(in_earlier[:, :2], k=[*range(1, min(_NEIGHBOURS, len(sparse.point_id)) + 1)])[1]
         point, camera = seen_by(sparse.obs_point, sparse.obs_image, near)
         by_poses, by_border, _ = posterior.derivatives(in_earlier, point, camera)
-        turned = kron(identity(len(place)), self.axes, format="csr")
+        turned = kron(identity(len(point_in_geo)), self.axes, format="csr")
         return np.asarray((turned @ hstack([by_poses, csr_matrix(by_border)])).toarray())
 
 

@@ -70,8 +70,8 @@ class SystematicErrors:
         """Return the place of an error in v; None if it is not among them."""
         wanted = (name, session, mode)
         places = (i for i, block in enumerate(self.blocks) if (block.name, block.session, block.mode) == wanted)
-        place = next(places, None)
-        return None if place is None else slice(3 * place, 3 * place + 3)
+        rank = next(places, None)
+        return None if rank is None else slice(3 * rank, 3 * rank + 3)
 
     def value(self, vector: FloatArray, name: ErrorName) -> FloatArray | None:
         """Return the components (3,) of an error without sessions in v (p,); None if it is not among them."""

@@ -278,10 +278,10 @@ class Linearised:
             weighted = (weights[kind][:, None] * rows.residual).ravel()
             slope_poses = slope_poses + rows.by_poses.T @ weighted
             border[: self._width] += rows.by_border.T @ weighted
-        poses, found = normal.solve(-slope_poses[:, None], -border[:, None])
+        poses, unknowns = normal.solve(-slope_poses[:, None], -border[:, None])
         moved = np.zeros(len(state.lens) + len(problem.errors))
-        moved[problem.lens] = found[: len(problem.lens), 0]
-        moved[len(state.lens) :] = found[len(problem.lens) :, 0][: len(problem.errors)]
+        moved[problem.lens] = unknowns[: len(problem.lens), 0]
+        moved[len(state.lens) :] = unknowns[len(problem.lens) :, 0][: len(problem.errors)]
         return poses.reshape(-1, 6), moved
 
     def spread(self, weights: Weights, kind: str, normal: NormalMatrix | None = None) -> FloatArray:

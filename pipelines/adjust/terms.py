@@ -197,17 +197,17 @@ class ControlPoints(MarkedTerm):
         return self._missed(self.places(at), at)
 
     def slopes(self, at: At) -> Slopes:
-        place, by_pose, by_lens_of_mark = self.place_slopes(at)
+        point_in_geo, by_pose, by_lens_of_mark = self.place_slopes(at)
         by_lens = np.zeros((len(self), 3, len(at.lens)))
         np.add.at(by_lens, self.point, by_lens_of_mark)
         by_errors = np.zeros((len(self), 3, len(at.vector)))
         if (columns := at.errors.columns("earlier-date")) is not None:
             by_errors[:, :, columns] = np.eye(3)
-        return Slopes(self._missed(place, at), self.point, self.camera, by_pose, by_lens, by_errors)
+        return Slopes(self._missed(point_in_geo, at), self.point, self.camera, by_pose, by_lens, by_errors)
 
-    def _missed(self, place: FloatArray, at: At) -> FloatArray:
+    def _missed(self, point_in_geo: FloatArray, at: At) -> FloatArray:
         shift = at.errors.value(at.vector, "earlier-date")
-        return place - self.position_in_geo + (0.0 if shift is None else shift)
+        return point_in_geo - self.position_in_geo + (0.0 if shift is None else shift)
 
 
 @dataclass(frozen=True)
@@ -228,11 +228,11 @@ class EarlierPoints(MarkedTerm):
         return self.places(at) - self.position_in_geo
 
     def slopes(self, at: At) -> Slopes:
-        place, by_pose, by_lens_of_mark = self.place_slopes(at)
+        point_in_geo, by_pose, by_lens_of_mark = self.place_slopes(at)
         by_lens = np.zeros((len(self), 3, len(at.lens)))
         np.add.at(by_lens, self.point, by_lens_of_mark)
         by_errors = np.zeros((len(self), 3, len(at.vector)))
-        return Slopes(place - self.position_in_geo, self.point, self.camera, by_pose, by_lens, by_errors)
+        return Slopes(point_in_geo - self.position_in_geo, self.point, self.camera, by_pose, by_lens, by_errors)
 
 
 @dataclass(frozen=True)
@@ -251,8 +251,8 @@ class Distances(MarkedTerm):
         return self.compared(self.places(at))[0]
 
     def slopes(self, at: At) -> Slopes:
-        place, by_pose, by_lens_of_mark = self.place_slopes(at)
-        residual, along = self.compared(place)
+        point_in_geo, by_pose, by_lens_of_mark = self.place_slopes(at)
+        residual, along = self.compared(point_in_geo)
         row, sign = np.divmod(self.point, 2)
         onto = (np.where(sign == 0, 1.0, -1.0)[:, None] * along[row])[:, None, :]
         by_lens = np.zeros((len(self), 1, len(at.lens)))
@@ -260,9 +260,9 @@ class Distances(MarkedTerm):
         by_errors = np.zeros((len(self), 1, len(at.vector)))
         return Slopes(residual, row, self.camera, onto @ by_pose, by_lens, by_errors)
 
-    def compared(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def compared(self, point_in_geo: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the residuals (D, 1) of points (2 D, 3), and the unit vectors (D, 3) between them."""
-        apart = place[::2] - place[1::2]
+        apart = point_in_geo[::2] - point_in_geo[1::2]
         length = np.linalg.norm(apart, axis=1, keepdims=True)
         return length - self.distance_m[:, None], apart / length
 

@@ -240,7 +240,7 @@ class CommonGrid:
         windows = list(self.windows())
         each = max(_SAMPLES // len(windows), 500)
         each_pair = max(_PAIRS // len(windows), 50)
-        found: list[tuple[FloatArray, ...]] = []
+        samples: list[tuple[FloatArray, ...]] = []
         pairs: dict[int, list[FloatArray]] = {lag: [] for lag in LAGS}
         designs: dict[int, list[FloatArray]] = {lag: [] for lag in LAGS}
         with progress.task("samples", len(windows)) as task:
@@ -254,14 +254,14 @@ class CommonGrid:
                 index = rng.choice(index, min(each, len(index)), replace=False)
                 row, column = np.unravel_index(index, counts.shape)
                 columns = [getattr(cells, one.name) for one in fields(cells)]
-                found.append(tuple(values[row, column] for values in (*columns, place)))
+                samples.append(tuple(values[row, column] for values in (*columns, place)))
                 for lag in LAGS:
                     one, two = _paired(flat, lag, each_pair, rng)
                     if len(one[0]):
                         pairs[lag].append(np.stack([_normalised(cells, one), _normalised(cells, two)], axis=1))
                         designs[lag].append(np.stack([_row(cells, place, one), _row(cells, place, two)], axis=1))
                 task.advance()
-        *columns, places = (np.concatenate(part) for part in zip(*found, strict=True))
+        *columns, places = (np.concatenate(part) for part in zip(*samples, strict=True))
         return Samples(
             Cells(*columns),
             places,

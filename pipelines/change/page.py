@@ -268,12 +268,12 @@ def sampled(path: Path) -> NDArray[Any]:
 
 def profile_facts(compared: Compared) -> tuple[ProfileFacts, ...]:
     """Return profiles along the longer axis of the largest regions, the largest first."""
-    found = []
+    facts = []
     for index in compared.largest[:_PROFILES]:
         profile = profile_through(compared, compared.polygons[index])
         picture = picture_of_png(profile_chart(profile, compared.names))
-        found.append(ProfileFacts(compared.change.regions[index].name, index, picture))
-    return tuple(found)
+        facts.append(ProfileFacts(compared.change.regions[index].name, index, picture))
+    return tuple(facts)
 
 
 def profile_through(compared: Compared, polygon: shapely.Geometry) -> ChangeProfile:

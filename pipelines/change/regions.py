@@ -184,24 +184,24 @@ def without_doubtful(
 ) -> tuple[FoundRegions, DoubtfulRegions]:
     """Return the regions that count, and those at some places of `found`, which do not, for a reason."""
     out = sorted(doubtful)
-    kept = [place for place in range(len(found.regions)) if place not in doubtful]
+    kept = [index for index in range(len(found.regions)) if index not in doubtful]
     moved = np.zeros(len(found.regions) + 1, dtype=np.int32)
     moved[np.array(kept, dtype=np.int64) + 1] = 1 + np.arange(len(kept))
     number, inside = moved[found.number], np.isin(found.number, np.array(out, dtype=np.int64) + 1)
     left = _named(
-        tuple(found.volumes[place] for place in kept),
-        [found.polygons[place] for place in kept],
-        given=sum(found.regions[place].name.startswith("P") for place in kept),
+        tuple(found.volumes[index] for index in kept),
+        [found.polygons[index] for index in kept],
+        given=sum(found.regions[index].name.startswith("P") for index in kept),
         sign=np.where(number > 0, found.sign, 0),
         number=number,
         noise=noise,
         cell_m2=cell_m2,
     )
     regions = tuple(
-        DoubtfulRegion(**found.regions[place].model_dump() | {"name": f"D{rank}"}, reason=reason)
-        for rank, place in enumerate(out, start=1)
+        DoubtfulRegion(**found.regions[index].model_dump() | {"name": f"D{rank}"}, reason=reason)
+        for rank, index in enumerate(out, start=1)
     )
-    return left, DoubtfulRegions(regions, [found.polygons[place] for place in out], inside)
+    return left, DoubtfulRegions(regions, [found.polygons[index] for index in out], inside)
 
 
 def _named(
@@ -216,7 +216,7 @@ def _named(
 ) -> FoundRegions:
     """Return regions by their volumes, of which the first are those of `given` polygons, with the others' sums."""
     of_found = every[given:]
-    names = [*(f"P{place + 1}" for place in range(given)), *(f"R{place + 1}" for place in range(len(of_found)))]
+    names = [*(f"P{index + 1}" for index in range(given)), *(f"R{index + 1}" for index in range(len(of_found)))]
     sums = {
         "lowered": [one for one in of_found if one.fill < one.cut],
         "raised": [one for one in of_found if one.fill > one.cut],
@@ -227,8 +227,8 @@ def _named(
     return FoundRegions(regions, lowered, raised, total, polygons, sign.astype(np.int8), number, every)
 
 
-def _outline(number: IntArray | NDArray[np.int32], which: int, place: tuple[slice, slice], grid: CommonGrid) -> Any:
-    rows, columns = place
+def _outline(number: IntArray | NDArray[np.int32], which: int, box: tuple[slice, slice], grid: CommonGrid) -> Any:
+    rows, columns = box
     cells = number[rows, columns] == which
     frame = grid.frame.part(columns.start, rows.start, cells.shape[1], cells.shape[0])
     return shapely.union_all(outlines(cells, frame))

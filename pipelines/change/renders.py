@@ -72,7 +72,7 @@ def render_pair(
 
 def nearest_to_middle(poses: list[ViewPose], point_in_model: FloatArray) -> int | None:
     """Return the index of the camera that shows a point (3,) nearest to the middle of its picture; None: no one."""
-    found = []
+    distances = []
     for index, pose in enumerate(poses):
         in_cam = pose.cam_from_model @ (point_in_model - pose.center_in_model)
         if in_cam[2] <= 0:
@@ -80,8 +80,8 @@ def nearest_to_middle(poses: list[ViewPose], point_in_model: FloatArray) -> int 
         size = np.array([pose.pinhole.width, pose.pinhole.height])
         off = np.abs(pose.pinhole.project(in_cam[None])[0] / size - 0.5)
         if (off < 0.5).all():
-            found.append((float(np.linalg.norm(off)), index))
-    return min(found)[1] if found else None
+            distances.append((float(np.linalg.norm(off)), index))
+    return min(distances)[1] if distances else None
 
 
 def _in_ecef(grid: CommonGrid, plan: tuple[float, float]) -> FloatArray:

@@ -206,8 +206,8 @@ def _stale_rasters(workspace: Workspace) -> Iterator[Remark]:
 
 
 def _summary(change: Change, warnings: tuple[Remark, ...], cautions: tuple[Remark, ...]) -> Summary:
-    found = change.regions
-    cut, fill = sum(one.cut_m3 for one in found), sum(one.fill_m3 for one in found)
+    regions = change.regions
+    cut, fill = sum(one.cut_m3 for one in regions), sum(one.fill_m3 for one in regions)
     registration = change.registration
     if registration.contradicts:
         sentence = (
@@ -219,7 +219,7 @@ def _summary(change: Change, warnings: tuple[Remark, ...], cautions: tuple[Remar
             f"{'' if change.common is not None else ', or tie the later epoch to the earlier (sfm --earlier)'}."
         )
         warnings = (*warnings, Remark(code="epochs-shifted", sentence=sentence, remedy=remedy))
-    figure = f"{len(found)} regions, {cut:.1f} m³ cut, {fill:.1f} m³ fill, "
+    figure = f"{len(regions)} regions, {cut:.1f} m³ cut, {fill:.1f} m³ fill, "
     if change.doubtful:
         figure += f"{len(change.doubtful)} doubtful, "
     figure += f"shift {registration.shift_m[2]:+.3f} ± {registration.sigma_shift_m[2]:.3f} m "
@@ -227,7 +227,7 @@ def _summary(change: Change, warnings: tuple[Remark, ...], cautions: tuple[Remar
     if change.common is not None:
         figure += f", {change.common.used} points in common, σ of the difference {change.common.sigma_v_m:.3f} m"
     values = {
-        "regions": len(found),
+        "regions": len(regions),
         "cut_m3": cut,
         "fill_m3": fill,
         "shift_m": registration.shift_m,
@@ -253,7 +253,7 @@ def _polygons(path: Path | None, field: str, after: EpochRasters, options: Chang
     west, south, east, north = after.frame.bounds
     across, up = np.meshgrid(np.linspace(west, east, _PLACES), np.linspace(south, north, _PLACES))
     places = crs.lla_from_xyz(np.column_stack([across.ravel(), up.ravel(), np.zeros(across.size)]))
-    found = read_outlines(
+    outlines = read_outlines(
         path,
         places,
         field=field,
@@ -268,7 +268,7 @@ def _polygons(path: Path | None, field: str, after: EpochRasters, options: Chang
 
         return [shapely.transform(part, to_rasters) for part in one.polygons]
 
-    return tuple(part for one in found for part in moved(one))
+    return tuple(part for one in outlines for part in moved(one))
 
 
 def _write_rasters(
@@ -328,9 +328,9 @@ def _counted(
         risen_m = partial(sampled_raster, parts.folder.parent / "difference.tif")
         surfaces = Surfaces(grid.crs, risen_m, noise.length_m)
         contradicts = contradicted(tied, found.regions, found.polygons, surfaces)
-    kept = [place for place in range(len(found.regions)) if place not in contradicts.whole]
+    kept = [index for index in range(len(found.regions)) if index not in contradicts.whole]
     left, doubtful = without_doubtful(found, contradicts.whole, DOUBTED, noise, grid.cell_m2)
-    partly = [one.name for one, place in zip(left.regions, kept, strict=True) if place in contradicts.part]
+    partly = [one.name for one, index in zip(left.regions, kept, strict=True) if index in contradicts.part]
     return left, doubtful, partly
 
 

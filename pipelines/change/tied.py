@@ -137,15 +137,15 @@ def contradicted(
     Polygons are in the plan of the CRS.
     """
     whole, part = [], []
-    for place, (region, polygon) in enumerate(zip(regions, polygons, strict=True)):
+    for index, (region, polygon) in enumerate(zip(regions, polygons, strict=True)):
         if not region.name.startswith("R"):
             continue
         least_m = _HALF * abs(region.net_m3) / region.area_m2
         shares = [_contradicted_share(step, polygon, surfaces, least_m) for step in tied.steps]
         if min(shares) >= _HALF:
-            whole.append(place)
+            whole.append(index)
         elif min(shares) > 0:
-            part.append(place)
+            part.append(index)
     return Contradicted(tuple(whole), tuple(part))
 
 
@@ -209,8 +209,8 @@ def _step(later: Epoch, earlier: Epoch) -> Step | None:
     if common is None or later.posterior.common is None:
         return None
     solved = [Solved(one.posterior, one.survey.origin_on_earth) for one in (later, earlier)]
-    found = relative(solved[0], solved[1], common)
-    return None if found.grid is None else Step(later, found, found.grid, float(common.spread))
+    comparison = relative(solved[0], solved[1], common)
+    return None if comparison.grid is None else Step(later, comparison, comparison.grid, float(common.spread))
 
 
 def _earlier_dates(workspace: Workspace, others: Sequence[Workspace]) -> list[Workspace]:
@@ -219,10 +219,10 @@ def _earlier_dates(workspace: Workspace, others: Sequence[Workspace]) -> list[Wo
     while len(line) <= _MOST_DATES and line[-1].has(COMMON_POINTS):
         common = CommonPoints.load(line[-1].path(COMMON_POINTS))
         there = (Workspace(Path(common.earlier)), *others)
-        found = next((one for one in there if _is_solved(one) and common.is_of(one)), None)
-        if found is None:
+        earlier = next((one for one in there if _is_solved(one) and common.is_of(one)), None)
+        if earlier is None:
             break
-        line.append(found)
+        line.append(earlier)
     return line
 
 

@@ -110,8 +110,8 @@ class _Pairs:
         sums = [Volume() for _ in self.found.polygons]
         for window in grid.windows():
             cells, frame = grid.registered(window, noise, applied=options.is_registered), grid.part(window)
-            for place, polygon in enumerate(self.found.polygons):
-                sums[place] += region_volumes(cells_inside(polygon, frame).astype(np.int64), cells, 1)[0]
+            for index, polygon in enumerate(self.found.polygons):
+                sums[index] += region_volumes(cells_inside(polygon, frame).astype(np.int64), cells, 1)[0]
         names = [region.name for region in self.found.regions]
         every = sum((one for one, name in zip(sums, names, strict=True) if name.startswith("R")), Volume())
         named = zip((*names, ALL), (*sums, every), strict=True)

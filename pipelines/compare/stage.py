@@ -79,48 +79,51 @@ def compare(
         raise InputError("georeference-frozen", message, field="--georeference")
     with workspace.lock(FOLDER):
         requests = read_requests(workspace.root)
-        asked = {**requests.get("train", {}), **requests.get(FOLDER, {}), **flags}
-        asked = {name: value for name, value in asked.items() if name in COMMON_TRAIN_OPTIONS}
-        if asked.get("georeference") == "frozen":  # of a training: the configurations decide what moves
-            del asked["georeference"]
-        plans = [(configuration, tuple(_plan(workspace, configuration, asked))) for configuration in configurations]
+        requested = {**requests.get("train", {}), **requests.get(FOLDER, {}), **flags}
+        requested = {name: value for name, value in requested.items() if name in COMMON_TRAIN_OPTIONS}
+        if requested.get("georeference") == "frozen":  # of a training: the configurations decide what moves
+            del requested["georeference"]
+        plans = [
+            (configuration, tuple(_plan(workspace, configuration, requested))) for configuration in configurations
+        ]
         for _, plan in plans:
             for planned in plan:
                 stage_config(planned.variant, planned.spec, planned.flags)  # a bad option costs no hours
-        remember(workspace.root, {FOLDER: asked})
+        remember(workspace.root, {FOLDER: requested})
     shared = run_pipeline(workspace, _SHARED, {}, progress=progress, around=lambda spec: around(workspace, spec))
     with workspace.lock(FOLDER):
         runner = _PlanRunner([ComparedStage(None, outcome) for outcome in shared], force, progress, around)
         rows = tuple(_row(configuration, plan, runner) for configuration, plan in plans)
         scalars = {
-            name: value if isinstance(value, bool | int | float) else str(value) for name, value in asked.items()
+            name: value if isinstance(value, bool | int | float) else str(value)
+            for name, value in requested.items()
         }
         table = Comparison(options=scalars, rows=rows)
         write_comparison(workspace.root / FOLDER, table, workspace.root.name)
     return table, runner.finished
 
 
-def _plan(workspace: Workspace, configuration: Configuration, asked: Flags) -> Iterator[VariantStage]:
+def _plan(workspace: Workspace, configuration: Configuration, requested: Flags) -> Iterator[VariantStage]:
     """Yield the stages of a configuration in order, after those of the configuration whose training it uses."""
     variant_folder, root = f"{FOLDER}/{configuration.name}", workspace.root
     shared = {spec.folder: root / spec.folder for spec in _SHARED}
-    seed = {"seed": asked["seed"]} if "seed" in asked else {}
+    seed = {"seed": requested["seed"]} if "seed" in requested else {}
     lent = dict(shared)  # folders that the variant reads and does not write
     if configuration.sim3 is None:
         yield VariantStage(Workspace(root / variant_folder, workspace, shared, FOLDER), ADJUST, seed)
         lent |= dict.fromkeys(("sfm", _INIT.folder), root / variant_folder / ADJUST.folder)
     if configuration.trained_by is not None:
         trainer = BY_CONFIGURATION[configuration.trained_by]
-        plan = _plan(workspace, trainer, asked)
+        plan = _plan(workspace, trainer, requested)
         yield from (planned for planned in plan if planned.spec is not _EVALUATE)
         lent[_TRAIN.folder] = root / FOLDER / trainer.name / _TRAIN.folder
     variant = Workspace(root / variant_folder, workspace, lent, FOLDER)
     if configuration.sim3 is not None:
         yield VariantStage(variant, _INIT, {**configuration.sim3, "max_residual": None, **seed})
     if configuration.trained_by is None:
-        yield VariantStage(variant, _TRAIN, {"georeference": "joint", **asked, **configuration.train})
+        yield VariantStage(variant, _TRAIN, {"georeference": "joint", **requested, **configuration.train})
     similarity = "trained" if configuration.trained_by is None else "initial"
-    backend = {"backend": asked["backend"]} if "backend" in asked else {}
+    backend = {"backend": requested["backend"]} if "backend" in requested else {}
     evaluated = read_requests(workspace.root).get(_EVALUATE.name, {})
     yield VariantStage(variant, _EVALUATE, {**evaluated, **backend, "similarity": similarity})
 
@@ -163,20 +166,20 @@ class _PlanRunner:
 def _row(configuration: Configuration, plan: Sequence[VariantStage], runner: _PlanRunner) -> ComparedRow:
     """Run a configuration and return the row of its figures."""
     log.info("configuration %s: %s", configuration.name, configuration.title)
-    told = {"configuration": configuration.name, "title": configuration.title, "note": configuration.note}
+    identity = {"configuration": configuration.name, "title": configuration.title, "note": configuration.note}
     try:
         # Of two runs of init-sim3 the later is the configuration's own.
         manifests = {planned.spec.name: runner.run(configuration, planned).manifest for planned in plan}
     except _RESULTS as error:
         log.warning("configuration %s failed: %s", configuration.name, error)
-        return ComparedRow(**told, failure=str(error))
+        return ComparedRow(**identity, failure=str(error))
     del manifests[_EVALUATE.name]  # Its warnings concern the survey, which all rows share.
     training = manifests[_TRAIN.name].values
     report = read_report(plan[-1].variant.path(REPORT))
     test = report.test_views
     assert test is not None and report.checkpoints.surface is not None  # every configuration trains
     return ComparedRow(
-        **told,
+        **identity,
         test_psnr=test.psnr,
         test_psnr_covered=test.psnr_covered,
         test_covered_share=test.covered_share,

@@ -160,10 +160,10 @@ def cells(row: ComparedRow) -> tuple[str, ...]:
 
 def reference_cells(row: ComparedRow) -> tuple[str, ...]:
     """Return the figures of a row against the reference as text, in the order of `REFERENCE_HEADS`."""
-    found = row.reference
-    if found is None:
+    reference = row.reference
+    if reference is None:
         return (MISSING,) * len(REFERENCE_HEADS)
-    return (_text(found.median_m), _text(found.nmad_m), *(_text(value, 3) for _, value in found.f1))
+    return (_text(reference.median_m), _text(reference.nmad_m), *(_text(value, 3) for _, value in reference.f1))
 
 
 def remarks_on(row: ComparedRow) -> tuple[str, ...]:

@@ -147,13 +147,13 @@ class BandPictures:
         """Return values (H, W, C) and factors of the weight as `Pictures.at` says."""
         # Pixels of an undistorted photograph are rays of SfM's lens, whatever lens led there.
         ray = self._pinholes[camera].rays(np.stack([u, v], axis=-1))
-        place = ray * z[..., None].astype(np.float64)
+        point = ray * z[..., None].astype(np.float64)
         values = np.empty((*u.shape, len(self.bands.lenses)), dtype=np.float32)
         factor = np.ones(u.shape, dtype=np.float32)
         for number, (lens, shot) in enumerate(zip(self.bands.lenses, self._instants[camera], strict=True)):
             images = self._images[lens.sensor]
             own = images.pinhole(shot.index)
-            in_lens = place @ shot.rotation.T + shot.shift_m
+            in_lens = point @ shot.rotation.T + shot.shift_m
             seen: BoolArray = (z > 0) & (in_lens[..., 2] > _AHEAD)
             depth = np.where(seen, in_lens[..., 2], 1.0)
             x, y = (
@@ -205,10 +205,10 @@ class _RigModel:
 
     def band(self, name: str) -> LensBand:
         """Return a band: counts if one of its photographs states no more."""
-        found = [self.stated[row] for row in self.of(name)]
-        quantities = {radiometry.quantity for _, radiometry in found}
+        stated = [self.stated[row] for row in self.of(name)]
+        quantities = {radiometry.quantity for _, radiometry in stated}
         quantity: Quantity = next(iter(quantities)) if len(quantities) == 1 else "counts"
-        return LensBand(name, found[0][0], quantity, all(radiometry.comparable for _, radiometry in found))
+        return LensBand(name, stated[0][0], quantity, all(radiometry.comparable for _, radiometry in stated))
 
     def beside(self, row: int, reference: int) -> tuple[FloatArray, FloatArray]:
         """Return rotation (3, 3) and translation (3,) of a photograph ← reference, in units of the model."""
@@ -237,12 +237,12 @@ def band_pictures(
     bands = Bands(tuple(rig.band(name) for name in rig.names))
     instants, left_out = _instants(model, survey, rig)
     images: dict[str, ImageCache] = {}
-    place: dict[int, int] = {}
+    number_of: dict[int, int] = {}
     for name in rig.names:
         files = [rig.files[row] for row in rig.of(name)]
         longest_px = max(max(each.camera.width, each.camera.height) for each in files)
         images[name] = ImageCache(workspace.cache / "undistorted", files, longest_px)
-        place |= {row: number for number, row in enumerate(rig.of(name))}
+        number_of |= {row: number for number, row in enumerate(rig.of(name))}
     index, scale = rig.sparse.image_index(), model.model_from_local.scale
     shots, pinholes = {}, {}
     for camera, rows in instants.items():
@@ -251,7 +251,7 @@ def band_pictures(
             rotation, shift = rig.beside(row, index[sfm.image_name[camera]])
             file, stated = rig.files[row], rig.stated[row][1]
             radiometry = Radiometry("counts") if band.quantity == "counts" else stated
-            made.append(_Shot(place[row], row, file.file, file.sha256, radiometry, rotation, scale * shift))
+            made.append(_Shot(number_of[row], row, file.file, file.sha256, radiometry, rotation, scale * shift))
         shots[camera] = tuple(made)
         lens = sfm.camera_of(camera)
         pinholes[camera] = pinhole_of(lens, max(lens.width, lens.height))
@@ -266,8 +266,8 @@ def _rig_model(workspace: Workspace, sfm: SparseModel, survey: Survey, progress:
     stated = {}
     with progress.task("tags of the bands", len(files)) as task:
         for row, photograph in enumerate(files):
-            if (found := _statement(photograph, thermal=of_row[row] == _THERMAL)) is not None:
-                stated[row] = found
+            if (statement := _statement(photograph, thermal=of_row[row] == _THERMAL)) is not None:
+                stated[row] = statement
             task.advance()
     return _RigModel(sparse, files, of_row, stated)
 
@@ -322,24 +322,24 @@ def _instants(
     beside: dict[str, list[str]] = {}
     for each in survey.companions:
         beside.setdefault(each.beside, []).append(each.name)
-    found: dict[int, list[int]] = {}
+    columns: dict[int, list[int]] = {}
     cameras = [camera for camera in model.indices("train") if model.cameras[camera].name in index]
     for camera in cameras:
         name = model.cameras[camera].name
         rows = [index[each] for each in (name, *beside.get(name, ())) if each in index]
         of_band = {rig.sensor[row]: row for row in rows if row in rig.stated}
         if all(band in of_band for band in names):
-            found[camera] = [of_band[band] for band in names]
-    if not found:
+            columns[camera] = [of_band[band] for band in names]
+    if not columns:
         message = f"At no instant are all bands ({', '.join(names)}) in the SfM model."
         raise InputError("bands-never-together", message, field="--bands")
-    if len(found) == len(cameras):
-        return found, ()
+    if len(columns) == len(cameras):
+        return columns, ()
     sentence = (
-        f"{len(cameras) - len(found)} of {len(cameras)} instants lack a band in the SfM model: bands.tif does "
+        f"{len(cameras) - len(columns)} of {len(cameras)} instants lack a band in the SfM model: bands.tif does "
         "without them."
     )
-    return found, (Remark(code="bands-instants-left-out", sentence=sentence),)
+    return columns, (Remark(code="bands-instants-left-out", sentence=sentence),)
 
 
 def _remarks(rig: _RigModel, bands: Bands) -> tuple[Remark, ...]:

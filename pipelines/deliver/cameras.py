@@ -188,11 +188,11 @@ def _write_covariances(folder: Path, model: SparseModel, posterior: Posterior | 
     of_cameras, of_points = np.full((len(model.image_name), 6, 6), np.nan), np.full((len(chosen), 3, 3), np.nan)
     if posterior is not None:
         turn, both = file_from_geo.rotation, np.kron(np.eye(2), file_from_geo.rotation)
-        place = np.full(len(rays), -1)
-        place[chosen] = np.arange(len(chosen))
-        seen = np.flatnonzero(place[model.obs_point] >= 0)
+        row_of = np.full(len(rays), -1)
+        row_of[chosen] = np.arange(len(chosen))
+        seen = np.flatnonzero(row_of[model.obs_point] >= 0)
         in_geo = file_from_geo.inverse().apply(position)
-        of_points = posterior.of_tie_points(in_geo, place[model.obs_point[seen]], model.obs_image[seen])
+        of_points = posterior.of_tie_points(in_geo, row_of[model.obs_point[seen]], model.obs_image[seen])
         of_cameras, of_points = both @ posterior.camera_cov @ both.T, turn @ of_points @ turn.T
     arrays: dict[str, ArrayLike] = {
         "camera_name": model.image_name,
@@ -310,8 +310,8 @@ def _footprints(
     features, corners = [], []
     for index, (name, center) in enumerate(zip(model.image_name, model.cam_center_in_local, strict=True)):
         in_file = borders[int(model.image_camera_id[index])] @ model.rotation_cam_from_local[index]
-        found = footprint(in_file, center, surface)
-        lla = lla_from_ecef(ecef_from_file.apply(found.outline))
+        shown = footprint(in_file, center, surface)
+        lla = lla_from_ecef(ecef_from_file.apply(shown.outline))
         east, north, up = table.sigma_enu_m[index].tolist()
         properties = {
             "name": name,
@@ -320,7 +320,7 @@ def _footprints(
             "sigma_e_m": east,
             "sigma_n_m": north,
             "sigma_u_m": up,
-            "clipped": found.clipped,
+            "clipped": shown.clipped,
         }
         features.append(feature(polygon(lla[:, [1, 0]]), properties))
         corners.append(lla)

@@ -175,13 +175,13 @@ class Tally:
 
 def _classes(sigma_m: FloatArray | np.ndarray) -> IntArray:
     known = np.maximum(sigma_m[np.isfinite(sigma_m)], _LEAST_M)
-    place = np.round(np.log(known / _LEAST_M) / np.log(_RATIO)).astype(np.int64)
-    return np.bincount(np.minimum(place, _CLASSES - 1), minlength=_CLASSES)
+    rank = np.round(np.log(known / _LEAST_M) / np.log(_RATIO)).astype(np.int64)
+    return np.bincount(np.minimum(rank, _CLASSES - 1), minlength=_CLASSES)
 
 
 def _median(classes: IntArray) -> float:
-    place = int(np.searchsorted(np.cumsum(classes), (classes.sum() + 1) // 2))
-    return float(_LEAST_M * _RATIO**place)
+    rank = int(np.searchsorted(np.cumsum(classes), (classes.sum() + 1) // 2))
+    return float(_LEAST_M * _RATIO**rank)
 
 
 def _write_points(

@@ -166,7 +166,7 @@ class _Views:
     def psnr_db(self, held: SplatArrays, whole: SplatArrays) -> float:
         """Return the mean PSNR of the renders of one splat against those of another, on black."""
         splats = [_gaussians(each) for each in (held, whole)]
-        found = []
+        psnr_of_views = []
         for pose, pinhole in zip(self._poses, self._pinholes, strict=True):
             with torch.no_grad():
                 image, target = (
@@ -175,8 +175,8 @@ class _Views:
                     ).colour
                     for each in splats
                 )
-            found.append(psnr(image, target.clamp(0, 1)))
-        return float(np.mean(found))
+            psnr_of_views.append(psnr(image, target.clamp(0, 1)))
+        return float(np.mean(psnr_of_views))
 
 
 def _gaussians(splat: SplatArrays) -> Gaussians:

@@ -184,7 +184,7 @@ def _model_on_map(solution: Solution, sfm: SparseModel, on_map: _Map, frame: Opf
     # As the adjusted cameras see them; a point that they do not see at all is left out.
     points = refined_points(network_of(sparse, poses, solution.point_in_model(sfm))).point_in_world
     known: BoolArray = np.asarray(np.isfinite(points).all(axis=1))
-    place = np.cumsum(known) - 1
+    row_of = np.cumsum(known) - 1
     seen = known[sparse.obs_point]
     return replace(
         sparse,
@@ -194,7 +194,7 @@ def _model_on_map(solution: Solution, sfm: SparseModel, on_map: _Map, frame: Opf
         point_in_local=frame.processing(on_map.xyz(similarity.apply(points[known]))),
         point_rgb=sparse.point_rgb[known],
         point_error_px=sparse.point_error_px[known],
-        obs_point=place[sparse.obs_point[seen]],
+        obs_point=row_of[sparse.obs_point[seen]],
         obs_image=sparse.obs_image[seen],
         obs_xy_px=sparse.obs_xy_px[seen],
     )
@@ -275,15 +275,15 @@ def _write_cloud(
 
 def _photographs(survey: Survey, names: Sequence[str], on_map: _Map) -> list[OpfPhotograph]:
     images = {image.name: image for image in survey.images}
-    found = []
+    photographs = []
     for name in names:
         image = images[name]
         xyz = sigma = None
         if image.fix is not None:
-            place, cov = np.array(image.fix.position_in_geo), np.array(image.fix.cov_in_geo)
-            xyz, sigma = on_map.measured(place, cov)
-        found.append(OpfPhotograph(name, image.timestamp_s, xyz, sigma))
-    return found
+            position, cov = np.array(image.fix.position_in_geo), np.array(image.fix.cov_in_geo)
+            xyz, sigma = on_map.measured(position, cov)
+        photographs.append(OpfPhotograph(name, image.timestamp_s, xyz, sigma))
+    return photographs
 
 
 def _points(survey: Survey, sparse: SparseModel, on_map: _Map) -> list[OpfPoint]:

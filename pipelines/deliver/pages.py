@@ -207,7 +207,7 @@ def page_template(name: str) -> str:
 
 def script_json(page: Product) -> str:
     """Return the content of a page as JSON for a script element, which no name can end: it has no `<`."""
-    return re.sub("[<>&\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", page.model_dump_json())
+    return re.sub("[<>&\u2028\u2029]", lambda match: f"\\u{ord(match[0]):04x}", page.model_dump_json())
 
 
 def _policy(program: str, cesium: str) -> str:
@@ -216,9 +216,9 @@ def _policy(program: str, cesium: str) -> str:
     CesiumJS starts workers from blobs, which load scripts from blobs, and decodes textures from blobs. Its decoder
     of SPZ is WebAssembly whose calls are made from text (`unsafe-eval`): else CesiumJS 1.145 does not start.
     """
-    found = _SCRIPT.search(program)
-    assert found is not None
-    own = base64.b64encode(hashlib.sha256(found[1].encode()).digest()).decode()
+    script = _SCRIPT.search(program)
+    assert script is not None
+    own = base64.b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
     library = quote(cesium, safe="/:@[]%") if urlsplit(cesium).netloc else "'self'"
     files = "'self'" if library == "'self'" else f"'self' {library}"
     return "; ".join(
@@ -431,12 +431,12 @@ def _coordinates(placement: Placement, target: TargetCrs, box_m: float) -> tuple
 def _cameras(poses: CameraPoses, sparse: SparseModel, file_from_model: Similarity) -> tuple[PageCamera, ...]:
     turn = file_from_model.rotation.T
     centers = np.round(file_from_model.apply(poses.cam_center_in_model), _DECIMALS_M)
-    found = []
+    cameras = []
     for index, name in enumerate(sparse.image_name):
         lens = sparse.camera_of(index)
         x, y, z = np.round(poses.cam_from_model[index] @ turn, _DECIMALS_ROTATION)
         focal_px = lens.mean_focal_px
-        found.append(
+        cameras.append(
             PageCamera(
                 name=name,
                 at=vector3(centers[index]),
@@ -444,7 +444,7 @@ def _cameras(poses: CameraPoses, sparse: SparseModel, file_from_model: Similarit
                 half=(lens.width / 2 / focal_px, lens.height / 2 / focal_px),
             )
         )
-    return tuple(found)
+    return tuple(cameras)
 
 
 def _measurement(
@@ -452,10 +452,10 @@ def _measurement(
 ) -> PageMeasurement:
     facts = [Fact(name="CRS", value=measured.crs)]
     if measured.kind == "point":
-        place, sigma = measured.points[0].xyz, measured.points[0].sigma_m
+        xyz, sigma = measured.points[0].xyz, measured.points[0].sigma_m
         decimals = 7 if target.crs.name == measured.crs and target.crs.is_geographic else 3
-        plan = ", ".join(f"{value:.{decimals}f}" for value in place[:2])
-        facts.append(Fact(name="Place", value=f"{plan}, {place[2]:.3f}"))
+        plan = ", ".join(f"{value:.{decimals}f}" for value in xyz[:2])
+        facts.append(Fact(name="Place", value=f"{plan}, {xyz[2]:.3f}"))
         if sigma is not None:
             facts.append(Fact(name="σ E, N, U", value=", ".join(length_text(value) for value in sigma)))
     return PageMeasurement(

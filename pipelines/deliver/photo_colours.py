@@ -215,13 +215,13 @@ class PhotoColours:
         # Blocks begin on whole multiples: rows and columns are added around.
         before = tuple(start % BLOCK for start in first)
         after = tuple(-(start + size) % BLOCK for start, size in zip(before, height.shape, strict=True))
-        place = np.pad(
+        point_in_model = np.pad(
             self._places(frame, height), [*zip(before, after, strict=True), (0, 0)], constant_values=np.nan
         )
-        views = self._candidates(place)
-        low, share, wanted = self._broad(place, views)
-        base = _between_blocks(low, share, place.shape[:2])
-        detail, camera = self._detail(place, views, wanted)
+        views = self._candidates(point_in_model)
+        low, share, wanted = self._broad(point_in_model, views)
+        base = _between_blocks(low, share, point_in_model.shape[:2])
+        detail, camera = self._detail(point_in_model, views, wanted)
         known = camera >= 0
         colours = np.where(known[..., None], base + detail, np.float32(np.nan)).astype(np.float32)
         own = tuple(slice(start, start + size) for start, size in zip(before, height.shape, strict=True))
@@ -229,7 +229,7 @@ class PhotoColours:
 
     def _places(self, frame: RasterFrame, height: FloatArray) -> Float32Array:
         """Return the places (H, W, 3) of cells in `model`; NaN: no surface."""
-        place = np.full((*height.shape, 3), np.nan, dtype=np.float32)
+        point_in_model = np.full((*height.shape, 3), np.nan, dtype=np.float32)
         known = np.isfinite(height)
         model_from_geo = self._source.geo_from_model.inverse()
         for top in range(0, len(height), _ROWS) if known.any() else ():
@@ -238,30 +238,32 @@ class PhotoColours:
             if len(row):
                 cell = np.column_stack([column, row + top]) + 0.5
                 in_geo = places_in_geo(self._source, frame, cell.astype(np.float64), height[rows][row, column])
-                place[rows][row, column] = model_from_geo.apply(in_geo)
-        return place
+                point_in_model[rows][row, column] = model_from_geo.apply(in_geo)
+        return point_in_model
 
-    def _candidates(self, place: Float32Array) -> list[_View]:
+    def _candidates(self, point_in_model: Float32Array) -> list[_View]:
         """Return the views that see most of a window, the best first."""
-        coarse = place[BLOCK // 2 :: BLOCK, BLOCK // 2 :: BLOCK].reshape(-1, 3)
+        coarse = point_in_model[BLOCK // 2 :: BLOCK, BLOCK // 2 :: BLOCK].reshape(-1, 3)
         coarse = coarse[np.isfinite(coarse[:, 0])]
-        found = []
+        weights = []
         shown = [number for number, camera in enumerate(self._source.views.cameras) if self._pictures.has(camera)]
         for number in shown if len(coarse) else ():
             view = self._view(number)
             u, v, z, cosine = self._seen_at(view, coarse)
             weight = np.where(z > 0, view.weight(u, v, z, cosine), 0.0)
             if (weight > 0).any():
-                found.append((float(weight.sum()), number))
-        return [self._view(number) for _, number in sorted(found, reverse=True)[:_MOST_VIEWS]]
+                weights.append((float(weight.sum()), number))
+        return [self._view(number) for _, number in sorted(weights, reverse=True)[:_MOST_VIEWS]]
 
-    def _broad(self, place: Float32Array, views: list[_View]) -> tuple[Float32Array, Float32Array, Float32Array]:
+    def _broad(
+        self, point_in_model: Float32Array, views: list[_View]
+    ) -> tuple[Float32Array, Float32Array, Float32Array]:
         """Return the blended colours (h, w, C) of blocks times their weight, that weight as 0 or 1, and weights.
 
         The weights (V, h, w) are those of each view in each block, without what has moved.
         """
-        sparse = place[_EVERY // 2 :: _EVERY, _EVERY // 2 :: _EVERY]
-        shape = (place.shape[0] // BLOCK, place.shape[1] // BLOCK)
+        sparse = point_in_model[_EVERY // 2 :: _EVERY, _EVERY // 2 :: _EVERY]
+        shape = (point_in_model.shape[0] // BLOCK, point_in_model.shape[1] // BLOCK)
         colours = np.full((len(views), *shape, len(self._pictures.moved)), np.nan, dtype=np.float32)
         weights = np.zeros((len(views), *shape), dtype=np.float32)
         for number, view in enumerate(views):
@@ -297,18 +299,18 @@ class PhotoColours:
         return factor
 
     def _detail(
-        self, place: Float32Array, views: list[_View], wanted: Float32Array
+        self, point_in_model: Float32Array, views: list[_View], wanted: Float32Array
     ) -> tuple[Float32Array, IntArray]:
         """Return what the best view of each cell shows beyond its broad colour (H, W, C), and its camera (H, W)."""
-        shape = (*place.shape[:2], len(self._pictures.moved))
-        detail, total = np.zeros(shape, dtype=np.float32), np.zeros(place.shape[:2], np.float32)
-        camera = np.full(place.shape[:2], -1, dtype=np.int64)
-        best = np.zeros(place.shape[:2], dtype=np.float32)
+        shape = (*point_in_model.shape[:2], len(self._pictures.moved))
+        detail, total = np.zeros(shape, dtype=np.float32), np.zeros(point_in_model.shape[:2], np.float32)
+        camera = np.full(point_in_model.shape[:2], -1, dtype=np.int64)
+        best = np.zeros(point_in_model.shape[:2], dtype=np.float32)
         highest = wanted.max(axis=0, initial=0.0)
         for view, weight in zip(views, wanted, strict=True):
             asked = binary_dilation((weight > 0) & (weight >= _BEST * highest), np.ones((3, 3)))
             rows, columns = _box(asked, BLOCK)
-            part = place[rows, columns]
+            part = point_in_model[rows, columns]
             if not part.size:
                 continue
             colour, shown, _ = self._colours(view, part)
@@ -331,19 +333,21 @@ class PhotoColours:
             best[rows, columns] = now
         return (detail / np.maximum(total, _TINY)[..., None]).astype(np.float32), camera
 
-    def _colours(self, view: _View, place: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
+    def _colours(
+        self, view: _View, point_in_model: Float32Array
+    ) -> tuple[Float32Array, Float32Array, Float32Array]:
         """Return colours (H, W, C) of a view at places (H, W, 3), whether it shows them, and weights."""
-        u, v, z, cosine = self._seen_at(view, place.reshape(-1, 3))
-        u, v, z, cosine = (values.reshape(place.shape[:2]) for values in (u, v, z, cosine))
+        u, v, z, cosine = self._seen_at(view, point_in_model.reshape(-1, 3))
+        u, v, z, cosine = (values.reshape(point_in_model.shape[:2]) for values in (u, v, z, cosine))
         shown, weight = view.shows(u, v, z), view.weight(u, v, z, cosine)
         colour, factor = self._pictures.at(view.seen.camera, view.pinhole, u, v, z)
         if factor is not None:
             weight = weight * factor
         return colour, np.where(weight > 0, shown, np.float32(0.0)), weight
 
-    def _reach(self, view: _View, place: Float32Array, size: int) -> BoolArray:
+    def _reach(self, view: _View, point_in_model: Float32Array, size: int) -> BoolArray:
         """Return the blocks (h, w) of places (H, W, 3) of which a view may show a part."""
-        middle = place[size // 2 :: size, size // 2 :: size]
+        middle = point_in_model[size // 2 :: size, size // 2 :: size]
         u, v, z, _ = self._seen_at(view, middle.reshape(-1, 3))
         slack = 0.05 * max(view.pinhole.width, view.pinhole.height)
         inside = (z > 0) & (u > -slack) & (u < view.pinhole.width + slack)
@@ -351,14 +355,14 @@ class PhotoColours:
         return np.asarray(inside.reshape(middle.shape[:2]))
 
     def _seen_at(
-        self, view: _View, place: Float32Array
+        self, view: _View, point_in_model: Float32Array
     ) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array]:
         """Return pixels u and v (K,), depths (K,) and the cosine to the vertical of places (K, 3).
 
         Of places without a surface, or behind the camera, the depth is 0 and the pixel −1, −1.
         """
         rotation = view.seen.cam_from_model.astype(np.float32)
-        arm = place - view.seen.cam_center_in_model.astype(np.float32)
+        arm = point_in_model - view.seen.cam_center_in_model.astype(np.float32)
         in_cam = arm @ rotation.T
         z = in_cam[:, 2]
         ahead = z > 1e-3  # not of NaN

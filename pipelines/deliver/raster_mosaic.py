@@ -275,19 +275,19 @@ class Mosaic:
     def colour(self, colours: PhotoColours, progress: Progress) -> None:
         """Colour the orthophoto's cells by the photographs that see them; the others keep the splat's colours."""
         names = ("orthophoto", "source")
-        for window, found in self._of_photographs(colours, "colours of the photographs", names, progress):
+        for window, cells in self._of_photographs(colours, "colours of the photographs", names, progress):
             rgba = read_cells(self._part(self._whole, "orthophoto", window))
-            number = np.where(rgba[3] > 0, found.camera + 1, 0)
-            seen = np.clip(np.round(np.nan_to_num(found.colours)), 0, 255).astype(np.uint8)
+            number = np.where(rgba[3] > 0, cells.camera + 1, 0)
+            seen = np.clip(np.round(np.nan_to_num(cells.colours)), 0, 255).astype(np.uint8)
             rgba[:3] = np.where(number > 0, seen, rgba[:3])
             self._write(self._coloured, window, {"orthophoto": rgba, "source": number[None].astype(np.uint16)})
 
     def add_bands(self, colours: PhotoColours, bands: Bands, progress: Progress) -> None:
         """Deliver the bands of a rig on the same cells, of the photographs that see them; the others are empty."""
         self._kinds["bands"] = RasterKind("float32", bands.described())
-        for window, found in self._of_photographs(colours, "bands", ("bands",), progress):
+        for window, cells in self._of_photographs(colours, "bands", ("bands",), progress):
             inside = read_cells(self._part(self._whole, "orthophoto", window))[3] > 0
-            values = bands.with_indices(found.colours)
+            values = bands.with_indices(cells.colours)
             self._write(self._coloured, window, {"bands": np.where(inside, values, np.float32(np.nan))})
 
     def _of_photographs(
@@ -302,8 +302,8 @@ class Mosaic:
                 if not all(self._part(self._coloured, name, window).exists() for name in names):
                     part, in_window, frame = self._around(window, MARGIN)
                     height = read_cells(heights, part)[0].astype(np.float64)
-                    found = colours.window(frame, (part[0].start, part[1].start), height)
-                    yield window, CellColours(found.colours[:, *in_window], found.camera[in_window])
+                    cells = colours.window(frame, (part[0].start, part[1].start), height)
+                    yield window, CellColours(cells.colours[:, *in_window], cells.camera[in_window])
                 task.advance()
 
     def add_source(self) -> None:

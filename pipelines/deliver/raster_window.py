@@ -468,9 +468,9 @@ def places_in_geo(source: RasterSource, frame: RasterFrame, cell: FloatArray, he
     low = np.array([0.0, 0.0, height.min()])
     size = np.array([frame.columns, frame.rows, max(height.max() - height.min(), 1.0)])
     nodes = np.stack(np.meshgrid(*3 * (np.linspace(0, 1, _FIT_NODES),), indexing="ij"), axis=-1).reshape(-1, 3)
-    place = low + nodes * size
+    pixel = low + nodes * size
     xyz = np.column_stack(
-        [frame.west + place[:, 0] * frame.step_x, frame.north - place[:, 1] * frame.step_y, place[:, 2]]
+        [frame.west + pixel[:, 0] * frame.step_x, frame.north - pixel[:, 1] * frame.step_y, pixel[:, 2]]
     )
     coefficients = np.linalg.lstsq(_quadratic(nodes), source.target.geo_from_xyz(xyz), rcond=None)[0]
     return np.asarray(_quadratic((np.column_stack([cell, height]) - low) / size) @ coefficients)
@@ -500,9 +500,9 @@ def georeference_sigma_maps(
 
 def between_nodes(values: FloatArray, nodes: tuple[FloatArray, ...], shape: tuple[int, ...]) -> FloatArray:
     """Return values in the middles of cells, linearly between those (R, C) of nodes at rows (R,), columns (C,)."""
-    for axis, (place, size) in enumerate(zip(nodes, shape, strict=True)):
-        at = np.interp(np.arange(size) + 0.5, place, np.arange(len(place)))
-        low = np.minimum(at.astype(np.int64), len(place) - 2)
+    for axis, (node, size) in enumerate(zip(nodes, shape, strict=True)):
+        at = np.interp(np.arange(size) + 0.5, node, np.arange(len(node)))
+        low = np.minimum(at.astype(np.int64), len(node) - 2)
         share = (at - low)[:, None] if axis == 0 else at - low
         values = (1 - share) * values.take(low, axis) + share * values.take(low + 1, axis)
     return values

@@ -77,7 +77,7 @@ def _scatter(error: FloatArray, cov: FloatArray) -> float:
     return float(np.sqrt(max(squared, 0.0) / len(flat)))
 
 
-def blunder_caution(names: Sequence[str], error_in_geo: FloatArray, found: Blunders) -> tuple[Remark, ...]:
+def blunder_caution(names: Sequence[str], error_in_geo: FloatArray, blunders: Blunders) -> tuple[Remark, ...]:
     """Return the caution that names the check points that are wrong, with their errors; none without any."""
     sizes = [
         f"{name} ({length_text(float(np.hypot(*error[:2])))} horizontally, {length_text(abs(float(error[2])))} "
@@ -85,8 +85,8 @@ def blunder_caution(names: Sequence[str], error_in_geo: FloatArray, found: Blund
         for name, error in zip(names, error_in_geo, strict=True)
     ]
     remarks = []
-    if found.wrong.any():
-        bad = [size for size, is_wrong in zip(sizes, found.wrong, strict=True) if is_wrong]
+    if blunders.wrong.any():
+        bad = [size for size, is_wrong in zip(sizes, blunders.wrong, strict=True) if is_wrong]
         left = len(sizes) - len(bad)
         sentence = (
             f"{len(bad)} of {len(sizes)} check points disagree{'s' if len(bad) == 1 else ''} with the solution far "
@@ -94,8 +94,8 @@ def blunder_caution(names: Sequence[str], error_in_geo: FloatArray, found: Blund
             "name and marks. The accuracy is stated with and without."
         )
         remarks.append(Remark(code="check-point-blunder", sentence=sentence))
-    if found.doubtful.any():
-        pair = [size for size, is_doubtful in zip(sizes, found.doubtful, strict=True) if is_doubtful]
+    if blunders.doubtful.any():
+        pair = [size for size, is_doubtful in zip(sizes, blunders.doubtful, strict=True) if is_doubtful]
         sentence = (
             f"The check points {listed(pair)} contradict each other far beyond σ: one of them is wrong, and a "
             "third one would tell which. Check coordinates, names and marks."

@@ -256,12 +256,12 @@ def distance_errors(survey: Survey, posterior: Posterior) -> tuple[report.Distan
     """Return the known distances of the survey, measured between the intersections of their ends' marks."""
     known, solution = survey.distances, posterior.solution
     rays = mark_rays([end for distance in known for end in distance.ends], posterior.sparse)
-    place = triangulated_points(solution, rays)
+    ends_in_geo = triangulated_points(solution, rays)
     rejected = {row.name for row in solution.measurements if row.kind == "distance" and not row.used}
-    length_m, sigma_m = np.linalg.norm(place[::2] - place[1::2], axis=1), np.full(len(known), np.nan)
+    length_m, sigma_m = np.linalg.norm(ends_in_geo[::2] - ends_in_geo[1::2], axis=1), np.full(len(known), np.nan)
     if (whole := np.isfinite(length_m)).any():
         ends = np.repeat(whole, 2)
-        sigma_m[whole] = np.sqrt(posterior.of_distances(place[ends], rays.of_points(ends)))
+        sigma_m[whole] = np.sqrt(posterior.of_distances(ends_in_geo[ends], rays.of_points(ends)))
 
     def stated(value: float) -> float | None:
         return float(value) if np.isfinite(value) else None

@@ -90,7 +90,7 @@ def compare_test_views(
     coverage = TrainingCoverage(renderer)
     distance = None if lpips_weights is None else Lpips(lpips_weights)
     with progress.task("test views", len(indices)) as task:
-        for place, index in enumerate(indices):
+        for rank, index in enumerate(indices):
             name = renderer.sparse.image_name[index]
             seen = renderer.render(index)
             render = through_lens(renderer, index, seen.colour.cpu()).clamp(0, 1)
@@ -110,7 +110,7 @@ def compare_test_views(
                 psnr_covered=None if covered is None or not covered.any() else psnr(render, photo, covered),
             )
             views.append(figures)
-            if place < saved:
+            if rank < saved:
                 save_render(name, _side_by_side(photo, render, figures))
             task.advance()
     means = ("psnr", "psnr_over_white", "psnr_compensated", "ssim", "psnr_covered", "covered_share", "lpips")

@@ -138,17 +138,17 @@ def _model(
         raise DegenerateGeometryError("surface-not-seen", message)
     sparse = overview.position_in_geo[first_of_voxels(overview.position_in_geo, 2 * _OVERVIEW_M)]
     normal, kind = plane_normals(sparse, 2 * _OVERVIEW_M), options.reference_align
-    found = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
+    alignment = fit_alignment(np.concatenate(sample), sparse, normal, 2 * _OVERVIEW_M, kind)
     if kind == "none":
-        return delivered, settings, None if found is None else found[1], None
-    if found is None:
+        return delivered, settings, None if alignment is None else alignment[1], None
+    if alignment is None:
         raise DegenerateGeometryError(
             "reference-not-aligned",
             "The surface and the reference overlap too little, or their shape leaves an axis open, so that the "
             f"{kind} between them cannot be estimated.",
             remedy="Compare with --reference-align none.",
         )
-    similarity, shift = found
+    similarity, shift = alignment
     moved = TiledPoints(scratch / "moved", delivered.side_m)
     for name in sorted(delivered.count):
         rows, own = delivered.around(name, 0.0)
@@ -172,9 +172,9 @@ def _sorted_reference(
 ) -> TiledPoints:
     (low, high), reference = box, TiledPoints(folder, _SQUARE_M)
     for chunk in files.chunks(origin, progress):
-        place = chunk.position_in_geo
-        inside = ((place >= low) & (place <= high)).all(axis=1)
-        reference.append(place[inside], None, chunk.classification[inside])
+        position = chunk.position_in_geo
+        inside = ((position >= low) & (position <= high)).all(axis=1)
+        reference.append(position[inside], None, chunk.classification[inside])
     return reference
 
 
@@ -191,10 +191,10 @@ _SHIFTED_SIGMAS = 3.0
 _SEEN = 0.05
 
 
-def cautions_of_reference(found: ComparedReference) -> tuple[Remark, ...]:
+def cautions_of_reference(compared: ComparedReference) -> tuple[Remark, ...]:
     """Return the limits of a comparison: assumptions, coarse points, a shift of the whole, unseen places."""
-    comparison = found.comparison
-    cautions = list(found.assumptions)
+    comparison = compared.comparison
+    cautions = list(compared.assumptions)
     fine = max(comparison.spacing_m, comparison.model_spacing_m)
     least = comparison.groups[0].scores[0].threshold_m
     if fine > least:
@@ -220,16 +220,16 @@ def cautions_of_reference(found: ComparedReference) -> tuple[Remark, ...]:
     return tuple(cautions)
 
 
-def draw_reference(found: ComparedReference, folder: Path) -> None:
+def draw_reference(compared: ComparedReference, folder: Path) -> None:
     """Write map and histogram of the distances along the normals; nothing if none was measured."""
-    cores, lod_m = found.cores, found.lod_m
+    cores, lod_m = compared.cores, compared.lod_m
     known = np.isfinite(cores.distance_m)
     if not known.any():
         return
     distance_m, kind = cores.distance_m[known], cores.kinds.of_class[known]
-    groups = {name: distance_m[kind == place] for place, name in enumerate(CLASSES) if (kind == place).any()}
+    groups = {name: distance_m[kind == index] for index, name in enumerate(CLASSES) if (kind == index).any()}
     if len(groups) == 1:
         groups = {"all": distance_m}
-    place, size_m = cores.position[known], found.comparison.cylinder_m
-    write_distance_map(folder / Path(REFERENCE_MAP).name, place[:, :2], distance_m, size_m)
+    position, size_m = cores.position[known], compared.comparison.cylinder_m
+    write_distance_map(folder / Path(REFERENCE_MAP).name, position[:, :2], distance_m, size_m)
     write_distance_histogram(folder / Path(REFERENCE_HISTOGRAM).name, groups, float(np.median(lod_m[known])))

@@ -48,15 +48,15 @@ class ComparisonSettings:
         spacing_m = max(reference_m, model_m, least_threshold_m / 2)
         return cls(least_threshold_m / 2, _CORE_SPACINGS * spacing_m, max(1.0, 4 * reference_m), cut)
 
-    def uncut(self, place: FloatArray) -> BoolArray:
+    def uncut(self, position: FloatArray) -> BoolArray:
         """Return at which of places (P, 3) a cylinder is not cut in the plan.
 
         A cut one holds points of the model alone on its outer side, whose mean height is another on uneven ground.
         """
         if self.cut is None:
-            return np.ones(len(place), dtype=bool)
+            return np.ones(len(position), dtype=bool)
         low, high = self.cut
-        inside = (place[:, :2] >= low[:2] + self.core_m) & (place[:, :2] <= high[:2] - self.core_m)
+        inside = (position[:, :2] >= low[:2] + self.core_m) & (position[:, :2] <= high[:2] - self.core_m)
         return np.asarray(inside.all(axis=1))
 
 
@@ -105,17 +105,17 @@ def compare_square(
     kept = first_of_voxels(rows["position"], settings.voxel_m)
     rows, own = rows[kept], own[kept]
     model_rows, model_own = model.around(square, margin_m)
-    place, normal, kinds = rows["position"], *_surface(rows, model_rows, settings)
+    position, normal, kinds = rows["position"], *_surface(rows, model_rows, settings)
     is_seen = np.zeros(len(rows), dtype=bool)
-    is_seen[own] = seen.sees(place[own])
-    to_model, _ = _nearest(place[is_seen], model_rows["position"])
-    covered = model_own & _covered(model_rows["position"], place, settings.cover_m)
-    to_reference, nearest = _nearest(model_rows["position"][covered], place)
-    usable = np.flatnonzero(is_seen & np.isfinite(normal[:, 0]) & settings.uncut(place))
-    cores = usable[first_of_voxels(place[usable], settings.core_m)]
+    is_seen[own] = seen.sees(position[own])
+    to_model, _ = _nearest(position[is_seen], model_rows["position"])
+    covered = model_own & _covered(model_rows["position"], position, settings.cover_m)
+    to_reference, nearest = _nearest(model_rows["position"][covered], position)
+    usable = np.flatnonzero(is_seen & np.isfinite(normal[:, 0]) & settings.uncut(position))
+    cores = usable[first_of_voxels(position[usable], settings.core_m)]
     model_every = at_random(model_rows["position"])
     distance_m, noise_m = m3c2(
-        every, model_every, place[cores], normal[cores], radius_m=settings.core_m, reach_m=_REACH_M
+        every, model_every, position[cores], normal[cores], radius_m=settings.core_m, reach_m=_REACH_M
     )
     return SquareDistances(
         to_reference,
@@ -123,7 +123,7 @@ def compare_square(
         to_model,
         rows_of(kinds, is_seen),
         int(own.sum()),
-        CorePoints(place[cores], normal[cores], distance_m, noise_m, rows_of(kinds, cores)),
+        CorePoints(position[cores], normal[cores], distance_m, noise_m, rows_of(kinds, cores)),
     )
 
 
@@ -146,11 +146,11 @@ def _surface(
     rows: NDArray[np.void], model_rows: NDArray[np.void], settings: ComparisonSettings
 ) -> tuple[FloatArray, Kinds]:
     """Return normals (P, 3) of the reference on the side of the model's normals, and the kinds of its points."""
-    place = rows["position"]
-    if not len(place):
+    position = rows["position"]
+    if not len(position):
         return np.zeros((0, 3)), kinds_of(rows["classification"], np.zeros((0, 3)))
     towards = model_rows["position"], model_rows["normal"].astype(np.float64)
-    normal = oriented_normals(place, settings.core_m / 2, *towards)
+    normal = oriented_normals(position, settings.core_m / 2, *towards)
     return normal, kinds_of(rows["classification"], normal)
 
 
@@ -192,13 +192,13 @@ class DistanceTally:
         self._cores: list[CorePoints] = []
         self.points = self.seen = 0  # of the reference: all, and those that photographs saw
 
-    def add(self, found: SquareDistances) -> None:
-        _count(self._to_reference, found.to_reference_m, found.model_kinds)
-        _count(self._to_model, found.to_model_m, found.reference_kinds)
-        self.points += found.points
-        self.seen += len(found.to_model_m)
-        if len(found.cores.position):
-            self._cores.append(found.cores)
+    def add(self, square: SquareDistances) -> None:
+        _count(self._to_reference, square.to_reference_m, square.model_kinds)
+        _count(self._to_model, square.to_model_m, square.reference_kinds)
+        self.points += square.points
+        self.seen += len(square.to_model_m)
+        if len(square.cores.position):
+            self._cores.append(square.cores)
 
     def cores(self) -> CorePoints:
         parts = [_NO_CORES, *self._cores]
@@ -232,10 +232,10 @@ class DistanceTally:
         groups = [group("all", "all", (every, every), kinds.of_class >= 0)]
         if self._to_model[1:].any() or self._to_reference[1:].any():
             groups += [
-                group(name, "class", (place, every), kinds.of_class == place) for place, name in enumerate(CLASSES)
+                group(name, "class", (index, every), kinds.of_class == index) for index, name in enumerate(CLASSES)
             ]
         groups += [
-            group(name, "slope", (every, place), kinds.of_slope == place) for place, name in enumerate(SLOPES)
+            group(name, "slope", (every, index), kinds.of_slope == index) for index, name in enumerate(SLOPES)
         ]
         return tuple(each for each in groups if each.kind == "all" or each.seen_points or each.c2c.count)
 
@@ -268,8 +268,8 @@ def m3c2_level_of_detection(noise_m: FloatArray, registration_m: FloatArray) -> 
 def _count(counts: IntArray, distance_m: FloatArray, kinds: Kinds) -> None:
     # Bin k holds distances in ((k − 1) mm, k mm]. Rounding first: 0.3 / 0.001 is 299.99… in floats.
     steps = np.ceil(np.round(np.minimum(distance_m, 2 * FARTHEST_M) / _STEP_M, 9))
-    place = np.minimum(steps, _BINS - 1).astype(np.int64)
-    np.add.at(counts, (kinds.of_class, kinds.of_slope, place), 1)
+    bin_number = np.minimum(steps, _BINS - 1).astype(np.int64)
+    np.add.at(counts, (kinds.of_class, kinds.of_slope, bin_number), 1)
 
 
 def _share_within(counts: IntArray, threshold_m: float) -> float | None:

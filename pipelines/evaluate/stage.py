@@ -151,8 +151,8 @@ def draw_accuracy(
 
 
 def _named(points: Sequence[SurveyedPoint], rows: Sequence[PointResidual]) -> NamedPlaces:
-    place = np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]
-    return NamedPlaces(place, tuple(point.name for point in points), error_array(rows))
+    plan = np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]
+    return NamedPlaces(plan, tuple(point.name for point in points), error_array(rows))
 
 
 def _coordinates(survey: Survey, crs: PointCrs | None, center: FloatArray) -> MapCoordinates:

@@ -47,9 +47,9 @@ def surface_heights(
     steps = around_m * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     plan = (surveyed[:, None, :2] + steps).reshape(-1, 2)
     with progress.task("surface at check points") as task:
-        found = heights_in_plan(renderer, plan, float(np.median(surveyed[:, 2])), _REACH_PX * pixel_m)
+        surface = heights_in_plan(renderer, plan, float(np.median(surveyed[:, 2])), _REACH_PX * pixel_m)
         task.advance()
-    height = found.height_m.reshape(len(points), len(steps))
+    height = surface.height_m.reshape(len(points), len(steps))
     difference = height[:, 0] - surveyed[:, 2]
     at_edge = np.ptp(np.where(np.isfinite(height), height, height[:, :1]), axis=1) > _STEP_M
     covered = difference > _STEP_M
@@ -76,13 +76,13 @@ def surface_accuracy(heights: Sequence[SurfaceHeight], points: Sequence[Surveyed
         ]
         return SurfaceErrors(check_points=len(square), rmse_v_m=float(np.sqrt(np.mean(square)))) if square else None
 
-    found = SurfaceAccuracy(
+    accuracy = SurfaceAccuracy(
         ground=errors("ground"),
         raised=errors("raised"),
         anywhere=errors(None),
         unseen=sum(row.du_m is None for row in heights),
     )
-    return found if found.parts else None
+    return accuracy if accuracy.parts else None
 
 
 def _raised(points: FloatArray, surveyed: FloatArray) -> BoolArray | None:

@@ -93,11 +93,11 @@ def open_files(path: Path) -> Iterator[BagFiles]:
         listed, others = _data_files(path, metadata, bag.notes)
         bag.stated = metadata.topics
         bag.storages = [_opened(file, room, bag.notes, stack) for file in listed]
-        found = len(bag.notes)
+        before = len(bag.notes)
         for file in others:
             _add_unlisted(bag, file, _opened(file, room, bag.notes, stack))
         if information is None:  # that no file is listed was said
-            bag.notes[found:] = [note for note in bag.notes[found:] if note.code != "bag-file-not-listed"]
+            bag.notes[before:] = [note for note in bag.notes[before:] if note.code != "bag-file-not-listed"]
         else:
             _note_differences(bag, metadata, {_storage_of(file) for file in listed})
         bag.storages.sort(key=lambda storage: storage.metadata.start_time)

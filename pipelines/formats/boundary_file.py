@@ -140,15 +140,15 @@ def read_boundary(path: Path, *, field: str) -> Boundary:
             layers = _gdal_layers(path, is_drawing=suffix == ".dxf", field=field)
     for layer in layers:
         _check_finite(layer, refusal)
-    found, remarks = _with_areas(layers, path.name)
-    if not found:
+    usable, remarks = _with_areas(layers, path.name)
+    if not usable:
         count = sum(len(layer.shapes) for layer in layers)
         raise refusal(
             "boundary-without-area",
             f"has {count} shapes, and none is a polygon.",
             remedy="Draw the boundary as one.",
         )
-    return Boundary(tuple(found), unit, suffix == ".dxf", remarks)
+    return Boundary(tuple(usable), unit, suffix == ".dxf", remarks)
 
 
 def _no_boundary(refusal: Refusal) -> InputError:
@@ -226,7 +226,7 @@ def _geometry(kind: str, coordinates: JsonValue) -> list[Any]:
     """Return the polygons and lines of a geometry of GeoJSON; the reader of it catches what is malformed."""
 
     def plan(places: JsonValue) -> list[tuple[float, float]]:
-        return [(float(place[0]), float(place[1])) for place in places]
+        return [(float(vertex[0]), float(vertex[1])) for vertex in places]
 
     if kind == "Polygon":
         rings = [plan(ring) for ring in coordinates]
@@ -236,7 +236,7 @@ def _geometry(kind: str, coordinates: JsonValue) -> list[Any]:
     if kind in ("MultiPolygon", "MultiLineString"):
         return [shape for part in coordinates for shape in _geometry(kind.removeprefix("Multi"), part)]
     if kind in ("Point", "MultiPoint"):
-        return [shapely.Point(*place[:2]) for place in ([coordinates] if kind == "Point" else coordinates)]
+        return [shapely.Point(*vertex[:2]) for vertex in ([coordinates] if kind == "Point" else coordinates)]
     raise ValueError(f"type {str(kind)[:40]}")
 
 
@@ -259,10 +259,10 @@ def _crs_member(member: JsonValue, refusal: Refusal) -> str:
 
 
 def _gdal_layers(path: Path, *, is_drawing: bool, field: str) -> list[_Shapes]:
-    found: list[_Shapes] = []
+    layers: list[_Shapes] = []
     for layer in read_layers(path, ("Layer", "PaperSpace") if is_drawing else (), field=field):
-        found += _drawn(layer) if is_drawing else [_Shapes(layer.name, list(layer.shapes), layer.crs)]
-    return [replace(one, shapes=[shape for shape in one.shapes if shape is not None]) for one in found]
+        layers += _drawn(layer) if is_drawing else [_Shapes(layer.name, list(layer.shapes), layer.crs)]
+    return [replace(one, shapes=[shape for shape in one.shapes if shape is not None]) for one in layers]
 
 
 def _drawn(read: ReadLayer) -> Iterator[_Shapes]:
@@ -276,8 +276,8 @@ def _drawn(read: ReadLayer) -> Iterator[_Shapes]:
 
 
 def _drawing_unit(data: bytes) -> tuple[str, float] | None:
-    if (found := _DXF_UNIT.search(data)) is not None:
-        return _DXF_UNITS.get(int(found[1]))
+    if (match := _DXF_UNIT.search(data)) is not None:
+        return _DXF_UNITS.get(int(match[1]))
     binary = _DXF_UNIT_BINARY.search(data)
     return None if binary is None else _DXF_UNITS.get(int.from_bytes(binary[1], "little"))
 
@@ -313,13 +313,13 @@ def _with_areas(layers: list[_Shapes], name: str) -> tuple[list[BoundaryLayer], 
         areas[at] = [shapely.Polygon(line.coords)]
         sentence = f"{name}: its line is open, and was closed by the straight line from its end to its beginning."
         remarks = (Remark(code="boundary-line-closed", sentence=sentence),)
-    found = []
+    usable = []
     for layer, polygons in zip(layers, areas, strict=True):
         valid = [part for shape in shapely.make_valid(polygons) for part in _simple_parts(shape)]
         valid = [part for part in valid if part.geom_type == "Polygon" and part.area > 0]
         if valid:
-            found.append(BoundaryLayer(layer.name, tuple(valid), layer.crs, layer.crs_is_default))
-    return found, remarks
+            usable.append(BoundaryLayer(layer.name, tuple(valid), layer.crs, layer.crs_is_default))
+    return usable, remarks
 
 
 def _simple_parts(shape: shapely.Geometry) -> Iterator[Any]:

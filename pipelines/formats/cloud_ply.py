@@ -156,7 +156,7 @@ def open_cloud_ply(path: Path) -> PlyCloudFile:
 
 def _vertices(path: Path, lines: list[list[str]]) -> tuple[int, list[tuple[str, str]]]:
     """Return the number of vertices, and name and type of their properties."""
-    elements = [place for place, line in enumerate(lines) if line[:1] == ["element"]]
+    elements = [number for number, line in enumerate(lines) if line[:1] == ["element"]]
     first = lines[elements[0]] if elements else []
     if len(first) != 3 or first[1] != "vertex" or not first[2].isdecimal() or len(first[2]) > 15:
         raise InputError("ply-elements", "The first element of the PLY is not a number of vertices.", path=path)

@@ -372,8 +372,8 @@ def reconstruction_of(model: SparseModel) -> Any:
         if np.isfinite(model.point_error_px[index]):
             point.error = model.point_error_px[index]
         point.track.elements = [
-            pycolmap.TrackElement(int(image_id), int(place))
-            for image_id, place in zip(observer[run], rank[run], strict=True)
+            pycolmap.TrackElement(int(image_id), int(slot))
+            for image_id, slot in zip(observer[run], rank[run], strict=True)
         ]
         reconstruction.add_point3D_with_id(int(point_id), point)
     return reconstruction

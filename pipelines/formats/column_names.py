@@ -193,10 +193,10 @@ def _without_measurer(name: str) -> list[str]:
     return [bare for bare in (*before, *after) if bare]
 
 
-def nearest_columns(found: Sequence[str], vocabulary: Mapping[str, str]) -> str:
-    """Return what the columns `found` may mean, as a sentence with a space before it; empty: nothing is near."""
+def nearest_columns(header: Sequence[str], vocabulary: Mapping[str, str]) -> str:
+    """Return what the columns `header` may mean, as a sentence with a space before it; empty: nothing is near."""
     near = []
-    for text in found:
+    for text in header:
         plain = plain_name(text)
         if not plain or meaning_of(text, vocabulary) is not None:
             continue
@@ -207,6 +207,6 @@ def nearest_columns(found: Sequence[str], vocabulary: Mapping[str, str]) -> str:
     return f" Perhaps {', '.join(near[:12])}: rename the columns." if near else ""
 
 
-def listed_columns(found: Sequence[str]) -> str:
+def listed_columns(header: Sequence[str]) -> str:
     """Return the names of columns for a message."""
-    return ", ".join(text.strip()[:40] or "(unnamed)" for text in found[:20]) + (" …" if len(found) > 20 else "")
+    return ", ".join(text.strip()[:40] or "(unnamed)" for text in header[:20]) + (" …" if len(header) > 20 else "")

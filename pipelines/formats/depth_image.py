@@ -92,10 +92,10 @@ def _read_exr(path: Path) -> DepthImage:
         remedy = "Name it Z, or write it alone."
         raise InputError("depth-channels", message, path=path, remedy=remedy)
     try:
-        with redirect_stdout(StringIO()) as told:  # OpenEXR prints there what it cannot read, and leaves those rows
+        with redirect_stdout(StringIO()) as printed:  # OpenEXR prints what it cannot read, and leaves those rows
             channels = _exr_channels(OpenEXR.File(str(path), separate_channels=True))
-        if told.getvalue():
-            raise ValueError(told.getvalue().strip())
+        if printed.getvalue():
+            raise ValueError(printed.getvalue().strip())
         pixels = channels[chosen]
     except Exception as error:
         raise _damaged(path, error) from error
@@ -124,8 +124,8 @@ def _depth_channel(names: list[str]) -> str | None:
     if len(names) == 1:
         return names[0]
     layered = [name for name in names if name.rpartition(".")[2] == "Z"]
-    found = [name for name in _DEPTH_CHANNELS if name in names]
-    return next(iter([*found, *layered]), None)
+    plain = [name for name in _DEPTH_CHANNELS if name in names]
+    return next(iter([*plain, *layered]), None)
 
 
 def _known(pixels: np.ndarray) -> Float32Array:

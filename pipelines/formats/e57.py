@@ -119,8 +119,8 @@ class E57File:
         local[~met] = 0.0
         if scan.single:
             check_precision(local[:, :1] if is_range else local, np.float32, self.path)
-        place = _from_spherical(local) if is_range else local
-        in_file = place @ scan.rotation.T + scan.translation
+        cartesian = _from_spherical(local) if is_range else local
+        in_file = cartesian @ scan.rotation.T + scan.translation
         return CloudChunk(in_file, np.zeros(len(met), np.uint8), np.zeros(len(met), bool), ~met, None)
 
 
@@ -166,16 +166,18 @@ def _xml_of(path: Path, size: int) -> Element:
         head = file.read(_HEADER.size)
         if len(head) < _HEADER.size or not head.startswith(_SIGNATURE):
             raise InputError("not-an-e57", "The file is not an E57 file.", path=path)
-        _, _, _, stated, place, length, page = _HEADER.unpack(head)
-        pages = math.ceil((length + place % _PAGE) / (_PAGE - _CHECKSUM))
-        if page != _PAGE or length > _MOST_XML or place + length > size:
-            message = f"The header states {stated} bytes and XML of {length} bytes at {place}; the file has {size}."
+        _, _, _, stated, offset, length, page = _HEADER.unpack(head)
+        pages = math.ceil((length + offset % _PAGE) / (_PAGE - _CHECKSUM))
+        if page != _PAGE or length > _MOST_XML or offset + length > size:
+            message = (
+                f"The header states {stated} bytes and XML of {length} bytes at {offset}; the file has {size}."
+            )
             raise InputError("size-differs", f"{message} It is cut off, damaged or too large.", path=path)
-        start = place // _PAGE * _PAGE
+        start = offset // _PAGE * _PAGE
         file.seek(start)
         data = file.read(pages * _PAGE)
     logical = b"".join(data[at : at + _PAGE - _CHECKSUM] for at in range(0, len(data), _PAGE))
-    text = logical[place - start : place - start + length]
+    text = logical[offset - start : offset - start + length]
     try:
         root: Element = fromstring(text, forbid_dtd=True)
     except (ParseError, DefusedXmlException, ValueError, LookupError) as error:
@@ -248,13 +250,13 @@ def _child(element: Element, name: str) -> Element | None:
 
 
 def _children(element: Element, name: str) -> list[Element]:
-    found = _child(element, name)
-    return [] if found is None else list(found)
+    child = _child(element, name)
+    return [] if child is None else list(child)
 
 
 def _text(element: Element, name: str) -> str:
-    found = _child(element, name)
-    return "" if found is None or found.text is None else found.text.strip()
+    child = _child(element, name)
+    return "" if child is None or child.text is None else child.text.strip()
 
 
 def _from_spherical(local: FloatArray) -> FloatArray:

@@ -358,10 +358,10 @@ def _altitude_reference(tags: Mapping[str, Tag], notes: _Notes) -> int:
 
 def _length_m(text: str) -> float | None:
     """Return metres of a text such as `396 m`, `396` or `1299 ft`."""
-    found = re.fullmatch(r"\s*([+-]?\d+(?:[.,]\d*)?)\s*(m|metres|meters|ft|feet)?\.?\s*", text, re.IGNORECASE)
-    if found is None:
+    match = re.fullmatch(r"\s*([+-]?\d+(?:[.,]\d*)?)\s*(m|metres|meters|ft|feet)?\.?\s*", text, re.IGNORECASE)
+    if match is None:
         return None
-    return float(with_decimal_point(found[1])) * (_FOOT_M if (found[2] or "").casefold().startswith("f") else 1.0)
+    return float(with_decimal_point(match[1])) * (_FOOT_M if (match[2] or "").casefold().startswith("f") else 1.0)
 
 
 def _direction(tags: Mapping[str, Tag]) -> float | None:
@@ -414,7 +414,7 @@ def _positive(value: float | None) -> float | None:
 
 def _xmp_positions(xmp: Xmp, notes: _Notes) -> list[GpsTag]:
     """Return the different positions of the camera that XMP states, in the order of the file."""
-    found: list[GpsTag] = []
+    tags: list[GpsTag] = []
     for lat_name, lon_names in _XMP_AXES:
         for each in xmp.named(lat_name):
             if each.within.casefold() not in _PLACES_OF_CAMERAS:
@@ -425,8 +425,8 @@ def _xmp_positions(xmp: Xmp, notes: _Notes) -> list[GpsTag]:
                 notes.problems.append("the latitude or longitude in XMP is not a number")
             elif _is_a_place(lat, lon, "position in XMP", notes):
                 void = (xmp.text("GpsStatus", namespace=each.namespace) or "").casefold() in _VOID
-                found.append(GpsTag(lat, lon, _xmp_altitude(xmp, each.namespace), None, "", "XMP", void))
-    return list(dict.fromkeys(found))
+                tags.append(GpsTag(lat, lon, _xmp_altitude(xmp, each.namespace), None, "", "XMP", void))
+    return list(dict.fromkeys(tags))
 
 
 def _xmp_degrees(text: str) -> float | None:

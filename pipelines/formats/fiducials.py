@@ -101,7 +101,7 @@ def find_tags(grey: ByteArray, dictionaries: Sequence[str]) -> list[FoundTag]:
     parameters.minMarkerPerimeterRate = 4 * LEAST_SIDE_PX / max(grey.shape)
     parameters.perspectiveRemovePixelPerCell = 8
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
-    found = []
+    tags = []
     for name in dictionaries:
         detector = cv2.aruco.ArucoDetector(_dictionary(name), parameters)
         corners, numbers, _ = detector.detectMarkers(grey)
@@ -112,8 +112,8 @@ def find_tags(grey: ByteArray, dictionaries: Sequence[str]) -> list[FoundTag]:
             if sides is None or not _shows(grey, _corners(sides.lines), tag_modules(name, int(number))):
                 continue
             middle, sigma = _center_with_sigma(sides)
-            found.append(FoundTag(name, int(number), middle, _corners(sides.lines), sigma))
-    return found
+            tags.append(FoundTag(name, int(number), middle, _corners(sides.lines), sigma))
+    return tags
 
 
 def _shows(grey: ByteArray, corners: FloatArray, modules: ByteArray) -> bool:
@@ -178,14 +178,14 @@ def _side(
     along = (end - start) / length
     normal = np.array([along[1], -along[0]])  # outward: corners go clockwise, and y goes down
     count = int(np.clip(length * (1 - 2 * _END_SHARE), _LEAST_PROFILES, _MOST_PROFILES))
-    place = np.linspace(_END_SHARE - 0.5, 0.5 - _END_SHARE, count) * length
+    along_side = np.linspace(_END_SHARE - 0.5, 0.5 - _END_SHARE, count) * length
     depth = float(normal @ (start + end - corners[2] - corners[3])) / 2 / modules  # of a module, inward
     if depth < _LEAST_MODULE_PX:
         return None
     reach = float(np.clip(_REACH_MODULES * depth, _LEAST_REACH_PX, _MOST_REACH_PX))
     offset = np.arange(-reach, reach + _STEP_PX / 2, _STEP_PX)
     middle = (start + end) / 2
-    pixel = middle + place[:, None, None] * along + offset[:, None] * normal - 0.5
+    pixel = middle + along_side[:, None, None] * along + offset[:, None] * normal - 0.5
     if (pixel < 0).any() or (pixel > np.array(grey.shape[::-1]) - 1).any():
         return None
     maps = pixel.astype(np.float32)
@@ -201,21 +201,21 @@ def _side(
     clear = rise.sum(axis=1) >= _LEAST_CONTRAST
     if clear.sum() < least:
         return None
-    place = place[clear]
+    along_side = along_side[clear]
     edge = rise[clear] @ (offset[:-1] + _STEP_PX / 2) / rise[clear].sum(axis=1)
     used = np.ones(len(edge), dtype=bool)
     for _ in range(3):
-        design = np.stack([np.ones(used.sum()), place[used]], axis=1)
+        design = np.stack([np.ones(used.sum()), along_side[used]], axis=1)
         (shift, slope), *_ = np.linalg.lstsq(design, edge[used], rcond=None)
-        residual = edge - shift - slope * place
+        residual = edge - shift - slope * along_side
         scatter = max(NORMAL_MAD * float(np.median(np.abs(residual[used]))), _LEAST_SIGMA_PX)
         used = np.abs(residual) <= _FAR_SIGMAS * scatter
         if used.sum() < least:
             return None
     variance = max(float(residual[used] @ residual[used]) / (used.sum() - 2), _LEAST_SIGMA_PX**2) * _PROFILES_OF_ONE
-    design = np.stack([np.ones(used.sum()), place[used]], axis=1)
+    design = np.stack([np.ones(used.sum()), along_side[used]], axis=1)
     cov = variance * np.linalg.inv(design.T @ design)
-    curved = np.column_stack([design, place[used] ** 2 * (4 / length**2)])
+    curved = np.column_stack([design, along_side[used] ** 2 * (4 / length**2)])
     bow = -float(np.linalg.lstsq(curved, edge[used], rcond=None)[0][2])
     bow_variance = variance * float(np.linalg.inv(curved.T @ curved)[2, 2])
     turned = normal - slope * along

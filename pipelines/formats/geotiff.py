@@ -302,8 +302,8 @@ def _warped(path: Path, frame: RasterFrame, resampling: str) -> Iterator[Any]:
 
     with _opened(path) as raster:
         empty = {} if raster.dtypes[0] == "uint8" else {"src_nodata": NODATA, "nodata": NODATA}
-        place = {"crs": raster.crs, **_cells(frame), "resampling": Resampling[resampling]}
-        with WarpedVRT(raster, **place, **empty) as warped:
+        target = {"crs": raster.crs, **_cells(frame), "resampling": Resampling[resampling]}
+        with WarpedVRT(raster, **target, **empty) as warped:
             yield warped
 
 
@@ -321,8 +321,8 @@ def outlines(cells: BoolArray, frame: RasterFrame) -> list[Any]:
     from rasterio.features import shapes
 
     transform = _transform(frame.resized(cells.shape[1], cells.shape[0]))
-    found = shapes(cells.astype(np.uint8), mask=cells, connectivity=8, transform=transform)
-    return [shapely.make_valid(shapely.geometry.shape(part)) for part, _ in found]
+    parts = shapes(cells.astype(np.uint8), mask=cells, connectivity=8, transform=transform)
+    return [shapely.make_valid(shapely.geometry.shape(part)) for part, _ in parts]
 
 
 def _transform(frame: RasterFrame) -> Any:
@@ -394,6 +394,6 @@ def _vrt(
             ElementTree.SubElement(source, "SourceFilename", relativeToVRT="1").text = path.name
             ElementTree.SubElement(source, "SourceBand").text = str(number)
             for name, x, y in (("SrcRect", 0, 0), ("DstRect", column, row)):
-                place = {"xOff": str(x), "yOff": str(y), "xSize": str(columns), "ySize": str(rows)}
-                ElementTree.SubElement(source, name, place)
+                window = {"xOff": str(x), "yOff": str(y), "xSize": str(columns), "ySize": str(rows)}
+                ElementTree.SubElement(source, name, window)
     return b"<?xml version='1.0' encoding='utf-8'?>\n" + bytes(ElementTree.tostring(root, encoding="utf-8"))

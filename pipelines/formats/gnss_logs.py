@@ -305,10 +305,10 @@ def read_subtitles(path: Path) -> VideoPositions:
             hours, minutes, seconds, thousandths = map(int, begins.groups())
             time_s = 3600 * hours + 60 * minutes + seconds + thousandths / 1000
             continue
-        found = [pattern.search(text) for pattern in (_LONGITUDE, _LATITUDE, _HEIGHT)]
-        if all(found) and (not values or time_s > values[-1][0]):
+        matches = [pattern.search(text) for pattern in (_LONGITUDE, _LATITUDE, _HEIGHT)]
+        if all(matches) and (not values or time_s > values[-1][0]):
             lines.append(line)
-            values.append([time_s, *(float(match[1]) for match in found if match)])
+            values.append([time_s, *(float(match[1]) for match in matches if match)])
     if not values:
         message = "No subtitle has latitude, longitude and abs_alt, as DJI's drones write them."
         raise InputError("subtitles-without-positions", message, path=path)

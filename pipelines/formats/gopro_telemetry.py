@@ -179,10 +179,10 @@ def _boxes(data: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
 def _box(data: bytes, kinds: tuple[bytes, ...], path: Path) -> bytes | None:
     """Return the content of the first box at a path of nested types; None: there is none."""
     for kind in kinds:
-        found = next((content for name, content in _boxes(data, path) if name == kind), None)
-        if found is None:
+        content_of_kind = next((content for name, content in _boxes(data, path) if name == kind), None)
+        if content_of_kind is None:
             return None
-        data = found
+        data = content_of_kind
     return data
 
 

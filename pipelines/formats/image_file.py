@@ -242,11 +242,11 @@ def _tiff_entries(data: bytes, at: int, count: int, order: str) -> Iterator[tupl
         size = {1: 1, 3: 2, 4: 4}.get(kind)
         if size is None or not length:
             continue
-        place = entry + 8
+        offset = entry + 8
         if size * length > 4:
-            (place,) = struct.unpack_from(order + "I", data, place)
-        if place + size <= len(data):
-            yield tag, struct.unpack_from(order + {1: "B", 2: "H", 4: "I"}[size], data, place)[0]
+            (offset,) = struct.unpack_from(order + "I", data, offset)
+        if offset + size <= len(data):
+            yield tag, struct.unpack_from(order + {1: "B", 2: "H", 4: "I"}[size], data, offset)[0]
 
 
 def deep_pixels(data: bytes) -> NDArray[Any] | None:

@@ -95,15 +95,15 @@ class _Reader:
             self.shapes.append(shapely.Polygon(self._outer, self._holes))
 
     def _places(self, words: list[str], separator: str) -> list[tuple[float, float]]:
-        found = []
+        places = []
         for word in words:
             values = word.split(separator)
             try:
-                found.append((float(values[0]), float(values[1])))
+                places.append((float(values[0]), float(values[1])))
             except (ValueError, IndexError):
                 message = f"has the coordinates {word[:60]!r}, which are no longitude and latitude."
                 raise self._refusal("boundary-unreadable", message) from None
-        return found
+        return places
 
     def _coordinates(self, places: list[tuple[float, float]]) -> None:
         """Take the places of the element that has just ended, by the elements around it."""

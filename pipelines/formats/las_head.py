@@ -99,28 +99,28 @@ def _records(stream: BinaryIO, head: bytes, size: int) -> Iterator[tuple[tuple[s
         at, count = struct.unpack_from("<QI", head, 235)
         places.append((_EVLR, at, min(count, _MOST_RECORDS)))
     for form, first, records in places:
-        place = first
+        offset = first
         for _ in range(records):
-            if not 0 < place <= size - form.size:
+            if not 0 < offset <= size - form.size:
                 break
-            stream.seek(place)
+            stream.seek(offset)
             name, number, length = form.unpack(stream.read(form.size))
             user = name.split(b"\0")[0].decode("latin-1").strip().lower()
-            place += form.size + length
-            wanted = user in (*_USERS, "laszip encoded") and length <= _MOST_CRS_BYTES and place <= size
+            offset += form.size + length
+            wanted = user in (*_USERS, "laszip encoded") and length <= _MOST_CRS_BYTES and offset <= size
             if wanted and (data := stream.read(length)).strip(b"\0 \r\n\t"):
                 yield (user, number), data
 
 
-def _crs(head: bytes, found: _Found) -> FileCrs:
-    every = [_text(one) for number in _WKT_RECORDS for user in _USERS for one in found.get((user, number), [])]
+def _crs(head: bytes, records: _Found) -> FileCrs:
+    every = [_text(one) for number in _WKT_RECORDS for user in _USERS for one in records.get((user, number), [])]
     texts = [text for text in every if text]
     # A placeholder in one record must not hide a CRS in another.
     wkt = next((text for text in texts if not _LOCAL.match(text)), texts[0] if texts else "")
     middle = tuple((low + high) / 2 for high, low in struct.iter_unpack("<2d", head[179:227]))
     return FileCrs(
         wkt=wkt,
-        keys=_geo_keys(found),
+        keys=_geo_keys(records),
         wkt_counts=bool(struct.unpack_from("<H", head, 6)[0] & _WKT_BIT),
         middle=(middle[0], middle[1], middle[2]) if all(map(math.isfinite, middle)) else None,
     )
@@ -134,10 +134,10 @@ def _text(data: bytes) -> str:
         return data.decode("latin-1").strip()
 
 
-def _geo_keys(found: _Found) -> dict[int, KeyValue]:
+def _geo_keys(records: _Found) -> dict[int, KeyValue]:
     """Return the keys of GeoTIFF with their values; damaged ones are left out."""
-    user = next((user for user in _USERS if (user, _KEYS) in found), "")
-    directory, doubles, texts = (found.get((user, key), [b""])[0] for key in (_KEYS, _DOUBLES, _TEXTS))
+    user = next((user for user in _USERS if (user, _KEYS) in records), "")
+    directory, doubles, texts = (records.get((user, key), [b""])[0] for key in (_KEYS, _DOUBLES, _TEXTS))
     words = [word for (word,) in struct.iter_unpack("<H", directory[: len(directory) // 2 * 2])]
     keys: dict[int, KeyValue] = {}
     for at in range(4, min(len(words), 4 + 4 * (words[3] if len(words) > 3 else 0)) - 3, 4):
@@ -151,13 +151,13 @@ def _geo_keys(found: _Found) -> dict[int, KeyValue]:
     return keys
 
 
-def _missing_table(path: Path, stream: BinaryIO, offset: int, size: int, found: _Found) -> int | None:
+def _missing_table(path: Path, stream: BinaryIO, offset: int, size: int, records: _Found) -> int | None:
     """Return the place of the pointer to a table of chunks that was never written; None: there is a table.
 
     Raises:
         InputError: the file is cut off, has more chunks than bytes, or points that only a table could find.
     """
-    compression = found.get(("laszip encoded", 22204), [b""])[0].ljust(16, b"\0")
+    compression = records.get(("laszip encoded", 22204), [b""])[0].ljust(16, b"\0")
     if struct.unpack_from("<H", compression)[0] == _POINTWISE:
         message = "The points are compressed as by LASzip before version 2, without chunks."
         remedy = "Write it again as LAZ."

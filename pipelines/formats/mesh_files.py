@@ -88,8 +88,8 @@ def write_mesh_glb(
 
     The material is unlit, since the photographs have the light of the day, and seen from both sides.
     """
-    position, place = vertices.astype("<f4"), uv.astype("<f4")
-    data = [position.tobytes(), place.tobytes(), faces.astype("<u4").tobytes(), texture_png(image)]
+    position, texture_uv = vertices.astype("<f4"), uv.astype("<f4")
+    data = [position.tobytes(), texture_uv.tobytes(), faces.astype("<u4").tobytes(), texture_png(image)]
     start = np.cumsum([0, *(len(part) + -len(part) % 4 for part in data)]).tolist()
     targets: tuple[dict[str, int], ...] = ({"target": _ARRAY}, {"target": _ARRAY}, {"target": _ELEMENTS}, {})
     primitive = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
@@ -110,7 +110,7 @@ def write_mesh_glb(
                 "bufferView": 0, "componentType": _FLOAT, "count": len(position), "type": "VEC3",
                 "min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist(),
             },
-            {"bufferView": 1, "componentType": _FLOAT, "count": len(place), "type": "VEC2"},
+            {"bufferView": 1, "componentType": _FLOAT, "count": len(texture_uv), "type": "VEC2"},
             {"bufferView": 2, "componentType": _UNSIGNED_INT, "count": faces.size, "type": "SCALAR"},
         ],
         "bufferViews": [

@@ -103,20 +103,20 @@ class _Scene:
                 primitive = self._primitive(number, part)
                 if primitive is None:
                     continue
-                place, corners = primitive
-                if vertices + len(place) > 3 * MOST_FACES or faces + len(corners) > MOST_FACES:
+                vertex, corners = primitive
+                if vertices + len(vertex) > 3 * MOST_FACES or faces + len(corners) > MOST_FACES:
                     message = f"The scene has more than {MOST_FACES} triangles, the limit."
                     raise InputError("mesh-too-large", message, path=self.path)
                 self.faces.append(corners + vertices)
-                self.vertices.append(place @ to_scene[:3, :3].T + to_scene[:3, 3])
-                faces, vertices = faces + len(corners), vertices + len(place)
-        place = np.concatenate([np.zeros((0, 3)), *self.vertices])
+                self.vertices.append(vertex @ to_scene[:3, :3].T + to_scene[:3, 3])
+                faces, vertices = faces + len(corners), vertices + len(vertex)
+        vertex = np.concatenate([np.zeros((0, 3)), *self.vertices])
         corners = np.concatenate([np.zeros((0, 3), np.int64), *self.faces])
         center = self._center()
         on_map = center is not None and not _is_earth_centred(center)
         if not on_map:
-            place = place @ _Z_UP_FROM_Y_UP.T
-        mesh = mesh_of(self.path, place, (corners.ravel(), np.full(len(corners), 3, np.int64)))
+            vertex = vertex @ _Z_UP_FROM_Y_UP.T
+        mesh = mesh_of(self.path, vertex, (corners.ravel(), np.full(len(corners), 3, np.int64)))
         crs = "" if center is None or on_map else "EPSG:4978"
         return replace(mesh, turned=not on_map, offset=center, crs=crs)
 
@@ -162,13 +162,13 @@ class _Scene:
         mode = primitive.get("mode", _TRIANGLES)
         if mode not in {_TRIANGLES, _STRIP, _FAN} or "POSITION" not in primitive["attributes"]:
             return None
-        place, is_float = self._accessor(primitive["attributes"]["POSITION"], "VEC3")
+        position, is_float = self._accessor(primitive["attributes"]["POSITION"], "VEC3")
         if is_float:
-            check_precision(place, np.float32, self.path)
+            check_precision(position, np.float32, self.path)
         if "indices" in primitive:
             corners = self._accessor(primitive["indices"], "SCALAR")[0].astype(np.int64).ravel()
         else:
-            corners = np.arange(len(place))
+            corners = np.arange(len(position))
         if mode == _STRIP:
             at = np.arange(max(len(corners) - 2, 0))
             odd = at % 2
@@ -178,10 +178,10 @@ class _Scene:
             triangles = np.column_stack([corners[np.zeros_like(at)], corners[at + 1], corners[at + 2]])
         else:
             triangles = corners[: len(corners) // 3 * 3].reshape(-1, 3)
-        if triangles.size and (triangles.min() < 0 or triangles.max() >= len(place)):
-            message = f"A face has the vertex {triangles.max()}; its part of the glb has {len(place)} vertices."
+        if triangles.size and (triangles.min() < 0 or triangles.max() >= len(position)):
+            message = f"A face has the vertex {triangles.max()}; its part of the glb has {len(position)} vertices."
             raise InputError("mesh-corner", message, path=self.path)
-        return place, triangles
+        return position, triangles
 
     def _accessor(self, number: int, kind: str) -> tuple[FloatArray, bool]:
         """Return the values (N, k) of an accessor, and whether they are floats."""

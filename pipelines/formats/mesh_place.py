@@ -73,17 +73,17 @@ def placed(mesh: TriangleMesh, *, crs_stated: bool, offset_stated: bool, flag: s
     own = sidecar_path(path)
     if own.is_file() and not offset_stated and not crs_stated:
         return _by_sidecar(path, own, vertices)
-    found = [PlaceFile(path, mesh.crs, mesh.offset), *_place_files(path)]
-    crs = next((one.crs for one in found if one.crs), "")
-    remarks = [*_differing_crs(path, found, flag)]
-    offsets = [one for one in found if one.offset is not None]
+    stated = [PlaceFile(path, mesh.crs, mesh.offset), *_place_files(path)]
+    crs = next((one.crs for one in stated if one.crs), "")
+    remarks = [*_differing_crs(path, stated, flag)]
+    offsets = [one for one in stated if one.offset is not None]
     for one in offsets[1:]:
         if not offset_stated and np.abs(_offset(one) - _offset(offsets[0])).max() > _SAME_OFFSET:
             texts = " and ".join(f"{_metres(_offset(each))} in {each.path.name}" for each in (offsets[0], one))
             message = f"Two files beside the mesh state different offsets: {texts}."
             remedy = f"Give {flag}-offset."
             raise InputError("mesh-offsets-differ", message, path=path, field=flag, remedy=remedy)
-    enu = next((one.enu for one in found if one.enu is not None), None)
+    enu = next((one.enu for one in stated if one.enu is not None), None)
     shift = np.zeros(3) if offset_stated or not offsets else _offset(offsets[0])
     if shift.any():
         name, middle = offsets[0].path.name, np.median(vertices, axis=0)
@@ -182,8 +182,8 @@ def _metadata(path: Path) -> PlaceFile:
     return PlaceFile(path, offset=offset, enu=Origin(lat_deg=lat, lon_deg=lon, alt_m=0.0))
 
 
-def _differing_crs(path: Path, found: list[PlaceFile], flag: str) -> Iterator[Remark]:
-    said = [one for one in found if one.crs or one.enu is not None]
+def _differing_crs(path: Path, stated: list[PlaceFile], flag: str) -> Iterator[Remark]:
+    said = [one for one in stated if one.crs or one.enu is not None]
     texts = [" ".join(one.crs.split()).lower() or "enu" for one in said]
     if len(set(texts)) > 1:
         shown = ", ".join(f"{(one.crs or 'ENU')[:60]!r} in {one.path.name}" for one in said)

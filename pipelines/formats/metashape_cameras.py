@@ -157,8 +157,8 @@ def _has_lens(sensor: _Sensor) -> bool:
 def _calibration(sensor: _Sensor) -> dict[str, float]:
     """Return the values of the adjusted calibration, or else of another one; empty: there is none."""
     classes = ("adjusted", *sensor.calibrations)
-    found = (sensor.calibrations.get(name, {}) for name in classes)
-    return next((values for values in found if {"f", "fx"} & set(values)), {})
+    calibrations = (sensor.calibrations.get(name, {}) for name in classes)
+    return next((values for values in calibrations if {"f", "fx"} & set(values)), {})
 
 
 def _lens(key: str, sensor: _Sensor, path: Path) -> ForeignLens:
@@ -207,15 +207,15 @@ class _Reader(XmlReader):
 
     def similarity(self, component: str) -> Similarity | None:
         """Return the similarity component → Earth, or None if the file states none."""
-        found = self._transforms.get(component, {})
-        if not {"rotation", "translation"} <= set(found):
+        transform = self._transforms.get(component, {})
+        if not {"rotation", "translation"} <= set(transform):
             return None
-        scale = float(found.get("scale", np.ones(1))[0])
-        rotation = found["rotation"].reshape(3, 3)
+        scale = float(transform.get("scale", np.ones(1))[0])
+        rotation = transform["rotation"].reshape(3, 3)
         if not scale > 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
             message = f"The transform of component {component!r} is no similarity."
             raise InputError("rotation-impossible", message, path=self.path, field="transform")
-        return Similarity(scale, rotation, found["translation"])
+        return Similarity(scale, rotation, transform["translation"])
 
     def begin(self, name: str, values: dict[str, str], parent: str) -> None:
         self._text = ""
@@ -255,8 +255,8 @@ class _Reader(XmlReader):
             pose = self._numbers(name, 16).reshape(4, 4)
             self._camera.pose = pose if pose.any() else None
         elif name in _OF_TRANSFORM and parent == "transform" and self._camera is None and self._text.strip():
-            place = self._component if self._component is not None else ""
-            self._transforms.setdefault(place, {})[name] = self._numbers(name, _OF_TRANSFORM[name])
+            component = self._component if self._component is not None else ""
+            self._transforms.setdefault(component, {})[name] = self._numbers(name, _OF_TRANSFORM[name])
         elif name == "reference" and parent == "chunk":
             self.crs = self._text.strip()
         elif name == "sensor":

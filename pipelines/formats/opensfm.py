@@ -171,11 +171,11 @@ def read_shots(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     """
     shots = [feature.properties for feature in load_json(_Shots, path).features]
     places = (path.with_name(CAMERAS), path.parent.parent / CAMERAS)
-    found = next((place for place in places if place.is_file()), None)
-    if found is None:
+    file = next((place for place in places if place.is_file()), None)
+    if file is None:
         message = f"The lenses are missing: put ODM's {CAMERAS} of the same project beside it."
         raise InputError("lens-missing", message, path=path, field=CAMERAS)
-    cameras = load_json(_Cameras, found).root
+    cameras = load_json(_Cameras, file).root
     photographs = []
     for shot in shots:
         world_from_cam = exp_so3(shot.rotation).T
@@ -184,7 +184,7 @@ def read_shots(path: Path, photo_size: PhotoSize) -> SolvedCameras:
                 shot.filename, _camera_of(shot, cameras, path), world_from_cam, np.array(shot.translation)
             )
         )
-    lenses = _lenses(cameras, {photograph.lens for photograph in photographs}, found)
+    lenses = _lenses(cameras, {photograph.lens for photograph in photographs}, file)
     remarks = [not_placed(ODM, "a map")]
     return solved_cameras(path, ODM, photographs, lenses, photo_size, remarks=remarks)
 

@@ -186,14 +186,16 @@ def read_opf(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     for frame in _all(project, _REFERENCE, _Reference, path):
         remarks.append(not_placed(PROGRAM, crs_name(frame.crs.definition)))
         break
-    tracks = next((_beside(found.uri, path) for found in item.resources if found.format == _GLTF), None)
+    tracks = next((_beside(resource.uri, path) for resource in item.resources if resource.format == _GLTF), None)
     ties = None if tracks is None else read_tracks(tracks, photograph_of, _beside)
     return solved_cameras(path, PROGRAM, photographs, lenses, photo_size, ties=ties, remarks=remarks)
 
 
 def has_tracks(path: Path) -> bool:
     """Return whether a project names a file of tie points."""
-    return any(found.format == _GLTF for item in _items(_project(path), "calibration") for found in item.resources)
+    return any(
+        resource.format == _GLTF for item in _items(_project(path), "calibration") for resource in item.resources
+    )
 
 
 def read_opf_points(path: Path) -> GroundPoints:
@@ -229,20 +231,20 @@ def read_opf_points(path: Path) -> GroundPoints:
         remedy = "Export those of one."
         raise InputError("several-crs", message, path=path, field="crs", remedy=remedy)
     for point in found:
-        place = point.geolocation
-        if place.crs.geoid_height is not None:
+        geolocation = point.geolocation
+        if geolocation.crs.geoid_height is not None:
             message = (
                 f"The heights of {point.id} are above a geoid of which one height alone is stated, "
-                f"{place.crs.geoid_height:g}."
+                f"{geolocation.crs.geoid_height:g}."
             )
             remedy = "Export the project with a geoid model, or list the points otherwise."
             raise InputError("geoid-height", message, path=path, field="geoid_height", remedy=remedy)
-        sigma_h_m, sigma_v_m = max(place.sigmas[:2]), place.sigmas[2]
+        sigma_h_m, sigma_v_m = max(geolocation.sigmas[:2]), geolocation.sigmas[2]
         points.append(
             ListedPoint(
                 line=1,
                 name=point.id,
-                xyz=place.coordinates,
+                xyz=geolocation.coordinates,
                 sigma_h_m=sigma_h_m if sigma_h_m > 0 else None,
                 sigma_v_m=sigma_v_m if sigma_v_m > 0 else None,
                 is_check=point.is_checkpoint,

@@ -146,5 +146,5 @@ class SurfaceWriter:
         self._arrays[0].more = {"min": low, "max": high}
         self._arrays[2].more = {"normalized": True}
         attributes = {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}
-        found = write_points(self._folder, self._name, self._arrays, attributes)
-        self.resources = [{**resource, "uri": f"{self._name}/{resource['uri']}"} for resource in found]
+        resources = write_points(self._folder, self._name, self._arrays, attributes)
+        self.resources = [{**resource, "uri": f"{self._name}/{resource['uri']}"} for resource in resources]

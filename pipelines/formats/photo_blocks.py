@@ -60,19 +60,19 @@ class _Found:
 
 def find_blocks(data: bytes) -> MetadataBlocks:
     """Return EXIF and XMP of a photograph, or of its beginning; other bytes are searched for XMP."""
-    found = _Found()
+    blocks = _Found()
     if data[:2] == _JPEG:
-        _find_in_jpeg(data, found)
+        _find_in_jpeg(data, blocks)
     elif data[:8] == _PNG:
-        _find_in_png(data, found)
+        _find_in_png(data, blocks)
     elif data[:4] in TIFF:
-        found.exif.append(data)
+        blocks.exif.append(data)
         packet = read_directory(data, wanted=(_XMP_TAG,), limit_bytes=_MAX_EXTENSION_BYTES).get(_XMP_TAG)
         if packet is not None:
-            found.xmp.append(packet.data)
-    if not found.xmp:
-        _search(data, found)
-    return MetadataBlocks(tuple(found.exif[:_MAX_BLOCKS]), tuple(found.xmp[:_MAX_BLOCKS]), tuple(found.problems))
+            blocks.xmp.append(packet.data)
+    if not blocks.xmp:
+        _search(data, blocks)
+    return MetadataBlocks(tuple(blocks.exif[:_MAX_BLOCKS]), tuple(blocks.xmp[:_MAX_BLOCKS]), tuple(blocks.problems))
 
 
 def jpeg_with_blocks(jpeg: bytes, exif: bytes | None, xmp: bytes | None) -> bytes:
@@ -93,13 +93,13 @@ def jpeg_with_blocks(jpeg: bytes, exif: bytes | None, xmp: bytes | None) -> byte
     return jpeg[:2] + app1 + jpeg[2:]
 
 
-def _find_in_jpeg(data: bytes, found: _Found) -> None:
+def _find_in_jpeg(data: bytes, blocks: _Found) -> None:
     extensions: dict[bytes, dict[int, bytes]] = {}
     for payload in _app1_segments(data):
         if payload.startswith(_EXIF):
-            found.add_exif(payload)
+            blocks.add_exif(payload)
         elif payload.startswith(_XMP):
-            found.xmp.append(payload[len(_XMP) :].lstrip(b"\x00"))
+            blocks.xmp.append(payload[len(_XMP) :].lstrip(b"\x00"))
         elif payload.startswith(_XMP_EXTENSION):
             head = len(_XMP_EXTENSION) + 40
             name, length, at = struct.unpack(">32sII", payload[len(_XMP_EXTENSION) : head].ljust(40, b"\xff"))
@@ -108,7 +108,7 @@ def _find_in_jpeg(data: bytes, found: _Found) -> None:
     for parts in extensions.values():
         packet = b"".join(parts[at] for at in sorted(parts))
         if b"RDF" in packet:  # and not the pictures that some cameras keep there
-            found.xmp.append(packet)
+            blocks.xmp.append(packet)
 
 
 def _app1_segments(data: bytes) -> Iterator[bytes]:
@@ -129,21 +129,21 @@ def _app1_segments(data: bytes) -> Iterator[bytes]:
             at += 2 + max(length, 2)
 
 
-def _find_in_png(data: bytes, found: _Found) -> None:
+def _find_in_png(data: bytes, blocks: _Found) -> None:
     at = 8
     while at + 8 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         body = data[at + 8 : at + 8 + length] if length <= _MAX_BLOCK_BYTES else b""
         at += 12 + length
         if kind == b"eXIf":
-            found.add_exif(body)
+            blocks.add_exif(body)
         elif kind in (b"tEXt", b"zTXt", b"iTXt"):
             keyword, _, rest = body.partition(b"\x00")
             text = _png_text(kind, rest)
             if keyword.startswith(b"Raw profile type "):
-                _add_profile(text, found)
+                _add_profile(text, blocks)
             elif keyword == _PNG_XMP and len(text) <= _MAX_EXTENSION_BYTES:
-                found.xmp.append(text)
+                blocks.xmp.append(text)
         elif kind == b"IEND":
             return
 
@@ -167,7 +167,7 @@ def _inflated(data: bytes) -> bytes:
         return b""
 
 
-def _add_profile(text: bytes, found: _Found) -> None:
+def _add_profile(text: bytes, blocks: _Found) -> None:
     """Add what ImageMagick writes as hexadecimal text: EXIF, XMP or a segment of a JPEG with either."""
     profile = _RAW_PROFILE.match(text)
     if profile is None:
@@ -177,21 +177,21 @@ def _add_profile(text: bytes, found: _Found) -> None:
     except ValueError:
         return
     if block.startswith(_XMP):
-        found.xmp.append(block[len(_XMP) :].lstrip(b"\x00"))
+        blocks.xmp.append(block[len(_XMP) :].lstrip(b"\x00"))
     elif block.lstrip()[:1] == b"<":
-        found.xmp.append(block)
+        blocks.xmp.append(block)
     else:
-        found.add_exif(block)
+        blocks.add_exif(block)
 
 
-def _search(data: bytes, found: _Found) -> None:
+def _search(data: bytes, blocks: _Found) -> None:
     """Add the XMP packets in the first and last mebibyte of a file."""
     for part in (data[:_SEARCHED_BYTES], data[max(_SEARCHED_BYTES, len(data) - _SEARCHED_BYTES) :]):
         begin = part.find(_OPEN)
-        while begin >= 0 and len(found.xmp) < _MAX_BLOCKS:
+        while begin >= 0 and len(blocks.xmp) < _MAX_BLOCKS:
             end = part.find(_CLOSE, begin, begin + _MAX_PACKET_BYTES)
             if end < 0:
-                found.problems.append("the XMP packet has no end within 256 KiB")
+                blocks.problems.append("the XMP packet has no end within 256 KiB")
                 return
-            found.xmp.append(part[begin : end + len(_CLOSE)])
+            blocks.xmp.append(part[begin : end + len(_CLOSE)])
             begin = part.find(_OPEN, end)

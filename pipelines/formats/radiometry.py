@@ -249,14 +249,14 @@ _NAMES = {
 }
 
 
-def _known(**found: float | None) -> tuple[dict[str, float], tuple[str, ...]]:
+def _known(**constants: float | None) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return the constants that can be used, and the tags that state none of the others; a divisor of 0 is none."""
     known = {
         name: value
-        for name, value in found.items()
+        for name, value in constants.items()
         if value is not None and math.isfinite(value) and (value > 0 or name == "black")
     }
-    return known, tuple(_NAMES[name] for name in found if name not in known)
+    return known, tuple(_NAMES[name] for name in constants if name not in known)
 
 
 def _over(numerator: float, denominator: float) -> float | None:

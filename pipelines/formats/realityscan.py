@@ -62,12 +62,12 @@ def read_camera_csv(path: Path, photo_size: PhotoSize) -> SolvedCameras:
         (('a.jpg',), [350.0])
     """
     lines = tables.numbered_lines(path)
-    found = header_line(lines)
-    if found is None:
+    header = header_line(lines)
+    if header is None:
         message = f"No line names the columns {', '.join(_NEEDED)}."
         remedy = "Export Internal/External camera parameters."
         raise InputError("header-missing", message, path=path, remedy=remedy)
-    number, text = found
+    number, text = header
     cells = tables.split(text.lstrip("# "), ",", path=path, line=number)
     columns, _ = tables.named_columns(cells, _VOCABULARY, path, number)
     tables.require_columns(columns, _NEEDED, path, number)

@@ -75,17 +75,17 @@ def read_rig_config(path: Path) -> tuple[RigConfig, ...]:
                 field=f"{number}.cameras",
             )
         lenses = []
-        for place, camera in enumerate(sorted(rig.cameras, key=lambda camera: not camera.ref_sensor)):
+        for rank, camera in enumerate(sorted(rig.cameras, key=lambda camera: not camera.ref_sensor)):
             if any(camera.image_prefix.startswith(p) or p.startswith(camera.image_prefix) for p in prefixes):
                 raise InputError(
                     "rig-prefix",
                     f"The prefix {camera.image_prefix!r} is the beginning of another camera's, or that of both: "
                     "no photograph may belong to two cameras.",
                     path=path,
-                    field=f"{number}.cameras.{place}.image_prefix",
+                    field=f"{number}.cameras.{rank}.image_prefix",
                 )
             prefixes.add(camera.image_prefix)
-            lenses.append(RigLens(camera.image_prefix, _quaternion(camera, path, f"{number}.cameras.{place}")))
+            lenses.append(RigLens(camera.image_prefix, _quaternion(camera, path, f"{number}.cameras.{rank}")))
         found.append(RigConfig(tuple(lenses)))
     return tuple(found)
 

@@ -235,9 +235,9 @@ def _points(ties: TiePoints | None, chosen: IntArray, count: int, path: Path) ->
         raise InputError(
             "values-not-finite", "Tie points have values that are no numbers.", path=path, field="points"
         )
-    place = np.full(count + 1, -1)  # the last one is for observations in no photograph
-    place[chosen] = np.arange(len(chosen))
-    image = place[np.where(ties.obs_photograph < 0, count, ties.obs_photograph)]
+    rank = np.full(count + 1, -1)  # the last one is for observations in no photograph
+    rank[chosen] = np.arange(len(chosen))
+    image = rank[np.where(ties.obs_photograph < 0, count, ties.obs_photograph)]
     kept = np.flatnonzero(image >= 0)
     # A program may list a point twice in one image: the first one counts.
     pairs, first = np.unique(np.stack([ties.obs_point[kept], image[kept]], axis=-1), axis=0, return_index=True)

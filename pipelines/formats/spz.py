@@ -237,17 +237,17 @@ def _unpacked_zstd(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_L
     if streams != len(layout.widths) or len(data) < _HEADER4_BYTES:
         raise _damage(f"{streams} streams instead of the {len(layout.widths)} of degree {layout.degree}", path)
     (table,) = struct.unpack_from("<I", data, _HEADER.size)
-    place = table + streams * _TABLE_ROW.size
-    if table < _HEADER4_BYTES or place > len(data):
+    offset = table + streams * _TABLE_ROW.size
+    if table < _HEADER4_BYTES or offset > len(data):
         raise _damage("its table lies outside the file", path)
     parts = []
     for index, width in enumerate(layout.widths):
         packed, size = _TABLE_ROW.unpack_from(data, table + index * _TABLE_ROW.size)
-        if size != width * layout.count or packed > len(data) - place:
+        if size != width * layout.count or packed > len(data) - offset:
             message = f"Stream {index} has another size than the header promises: the file is cut off or damaged."
             raise InputError("size-differs", message, path=path)
         try:
-            with zstandard.ZstdDecompressor().stream_reader(data[place : place + packed]) as reader:
+            with zstandard.ZstdDecompressor().stream_reader(data[offset : offset + packed]) as reader:
                 part = reader.read(size + 1)
         except zstandard.ZstdError as error:
             raise _damage(f"{error}", path) from error
@@ -255,7 +255,7 @@ def _unpacked_zstd(data: bytes, limit_bytes: int, path: Path | None) -> tuple[_L
             message = f"Stream {index} unpacks to another size than the header promises: the file is damaged."
             raise InputError("unpacked-size-differs", message, path=path)
         parts.append(part)
-        place += packed
+        offset += packed
     extensions = data[_HEADER4_BYTES:table] if layout.has_extensions else b""
     return layout, np.frombuffer(b"".join(parts), np.uint8), extensions
 

@@ -57,8 +57,8 @@ def encode_georeference(georeference: SpzGeoreference) -> bytes:
     crs = georeference.crs.encode()
     flags = (_HAS_EPOCH if georeference.epoch is not None else 0) | _syntax(georeference.crs) << 1
     epoch = math.nan if georeference.epoch is None else georeference.epoch
-    place = (*georeference.origin, *georeference.quat_xyzw, georeference.scale, epoch)
-    payload = _NEWEST.pack(1, flags, len(crs), *place) + crs
+    values = (*georeference.origin, *georeference.quat_xyzw, georeference.scale, epoch)
+    payload = _NEWEST.pack(1, flags, len(crs), *values) + crs
     return _RECORD.pack(GEOREFERENCE, len(payload)) + payload
 
 
@@ -83,26 +83,26 @@ def require_known_axes(extensions: bytes, path: Path | None = None) -> None:
 
 
 def _records(extensions: bytes, path: Path | None) -> Iterator[tuple[int, bytes]]:
-    place = 0
-    while place < len(extensions):
-        if len(extensions) - place < _RECORD.size:
+    offset = 0
+    while offset < len(extensions):
+        if len(extensions) - offset < _RECORD.size:
             raise InputError("file-damaged", "An extension of the SPZ file is cut off.", path=path)
-        kind, size = _RECORD.unpack_from(extensions, place)
-        place += _RECORD.size
-        if size > len(extensions) - place:
-            message = f"Extension {kind:#010x} promises {size} bytes; {len(extensions) - place} are left."
+        kind, size = _RECORD.unpack_from(extensions, offset)
+        offset += _RECORD.size
+        if size > len(extensions) - offset:
+            message = f"Extension {kind:#010x} promises {size} bytes; {len(extensions) - offset} are left."
             raise InputError("file-damaged", message, path=path)
-        yield kind, extensions[place : place + size]
-        place += size
+        yield kind, extensions[offset : offset + size]
+        offset += size
 
 
 def _decoded(payload: bytes, path: Path | None) -> SpzGeoreference:
     faults = []
     for layout in (_newest, _with_provenance, _with_epsg):
-        found = layout(payload)
-        fault = "another length" if found is None else _fault(found)
-        if found is not None and not fault:
-            return found
+        georeference = layout(payload)
+        fault = "another length" if georeference is None else _fault(georeference)
+        if georeference is not None and not fault:
+            return georeference
         faults.append(fault)
     raise InputError("spz-georeference", f"The georeference in the SPZ file has {faults[0]}.", path=path)
 
@@ -110,32 +110,32 @@ def _decoded(payload: bytes, path: Path | None) -> SpzGeoreference:
 def _newest(payload: bytes) -> SpzGeoreference | None:
     if len(payload) < _NEWEST.size:
         return None
-    version, flags, length, *place = _NEWEST.unpack_from(payload)
+    version, flags, length, *values = _NEWEST.unpack_from(payload)
     crs = payload[_NEWEST.size :]
-    return _placed(version, flags, place, crs) if len(crs) == length and flags >> 1 & 3 <= _PROJJSON else None
+    return _placed(version, flags, values, crs) if len(crs) == length and flags >> 1 & 3 <= _PROJJSON else None
 
 
 def _with_provenance(payload: bytes) -> SpzGeoreference | None:
     if len(payload) < _WITH_PROVENANCE.size:
         return None
-    version, flags, length, other, *place = _WITH_PROVENANCE.unpack_from(payload)
+    version, flags, length, other, *values = _WITH_PROVENANCE.unpack_from(payload)
     texts = payload[_WITH_PROVENANCE.size :]
-    return _placed(version, flags, place, texts[:length]) if len(texts) == length + other else None
+    return _placed(version, flags, values, texts[:length]) if len(texts) == length + other else None
 
 
 def _with_epsg(payload: bytes) -> SpzGeoreference | None:
     if len(payload) < _WITH_EPSG.size:
         return None
-    version, flags, _, code, *place, length = _WITH_EPSG.unpack_from(payload)
+    version, flags, _, code, *values, length = _WITH_EPSG.unpack_from(payload)
     return (
-        _placed(version, flags, place, f"EPSG:{code}".encode())
+        _placed(version, flags, values, f"EPSG:{code}".encode())
         if len(payload) == _WITH_EPSG.size + length
         else None
     )
 
 
-def _placed(version: int, flags: int, place: list[float], crs: bytes) -> SpzGeoreference | None:
-    x, y, z, *quat, scale, epoch = place
+def _placed(version: int, flags: int, values: list[float], crs: bytes) -> SpzGeoreference | None:
+    x, y, z, *quat, scale, epoch = values
     try:
         text = crs.decode()
     except UnicodeDecodeError:

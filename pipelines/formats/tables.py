@@ -354,10 +354,10 @@ def unknown_header(
 ) -> InputError:
     """Return the error of a header without the columns that are needed: what was found, and what is near."""
     lacks, near = ", ".join(missing), column_names.nearest_columns(header, vocabulary)
-    found = column_names.listed_columns(header)
+    columns = column_names.listed_columns(header)
     known = any(column_names.meaning_of(text, vocabulary) for text in header)
     message = (
-        f"The header has no column {lacks}. It has {found}" if lacks else f"The header has the columns {found}"
+        f"The header has no column {lacks}. It has {columns}" if lacks else f"The header has the columns {columns}"
     )
     code = "column-missing" if known else "header-missing"
     return InputError(code, f"{message}; needed are {needed}.{near}", path=path, line=line)

@@ -78,12 +78,12 @@ def read_directory(
             (at,) = struct.unpack_from(order + "I", block, 4)
         (count,) = struct.unpack_from(order + "H", block, at)
         for entry in range(min(count, _MAX_ENTRIES)):
-            place = at + 2 + 12 * entry
-            number, kind, values = struct.unpack_from(order + "HHI", block, place)
+            offset = at + 2 + 12 * entry
+            number, kind, values = struct.unpack_from(order + "HHI", block, offset)
             if kind not in _TYPES or number in tags or (wanted is not None and number not in wanted):
                 continue
             size = _TYPES[kind][0] * values
-            begin = place + 8 if size <= 4 else struct.unpack_from(order + "I", block, place + 8)[0]
+            begin = offset + 8 if size <= 4 else struct.unpack_from(order + "I", block, offset + 8)[0]
             if size <= min(limit_bytes, left) and begin + size <= len(block):
                 tags[number] = Tag(kind, block[begin : begin + size], order)
                 left -= size

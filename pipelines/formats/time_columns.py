@@ -70,19 +70,19 @@ def _times_of_week(table: tables.Table) -> FloatArray:
 def _dates(table: tables.Table) -> Sequence[date]:
     """Return the dates of the rows; day and month count as the whole column shows them."""
     texts = [row.text("date") for row in table.rows]
-    last = [found for text in texts if (found := _DATE_LAST.fullmatch(text)) is not None]
-    day_first, month_first = any(int(found[1]) > 12 for found in last), any(int(found[2]) > 12 for found in last)
+    last = [match for text in texts if (match := _DATE_LAST.fullmatch(text)) is not None]
+    day_first, month_first = any(int(match[1]) > 12 for match in last), any(int(match[2]) > 12 for match in last)
     dates = []
     for row, text in zip(table.rows, texts, strict=True):
-        found = _DATE_LAST.fullmatch(text)
-        if found is not None and day_first == month_first and found[1] != found[2] and "." not in text:
+        match = _DATE_LAST.fullmatch(text)
+        if match is not None and day_first == month_first and match[1] != match[2] and "." not in text:
             message = f"Whether {text!r} begins with the day or the month is not known."
             raise row.fault("date-ambiguous", message, "date", remedy="Write it as 2024-05-31.")
         try:
-            if found is None:
+            if match is None:
                 dates.append(_calendar(text))
             else:
-                first, second, year = map(int, found.groups())
+                first, second, year = map(int, match.groups())
                 dates.append(date(year, first, second) if month_first else date(year, second, first))
         except ValueError:
             raise row.fault("date-invalid", f"{text!r} is not a date such as 2024-05-31", "date") from None
@@ -91,9 +91,9 @@ def _dates(table: tables.Table) -> Sequence[date]:
 
 def _calendar(text: str) -> date:
     """Return the date of a text with the year first; a ValueError: it is none."""
-    found = _DATE_FIRST.fullmatch(text)
-    if found is not None and found[4] is None:
-        return date(int(found[1]), int(found[2]), int(found[3]))
+    match = _DATE_FIRST.fullmatch(text)
+    if match is not None and match[4] is None:
+        return date(int(match[1]), int(match[2]), int(match[3]))
     if re.fullmatch(r"\d{8}", text):
         return date(int(text[:4]), int(text[4:6]), int(text[6:]))
     raise ValueError(text)

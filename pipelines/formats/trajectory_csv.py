@@ -119,10 +119,10 @@ def read_trajectory(path: Path, *, projected: bool = False) -> PoseTable:
     """
     table, header = _read_table(path)
     line = table.header_line or 1
-    place = place_columns(header, table.columns, _VOCABULARY, projected=projected, path=path, line=line)
-    xyz = place.numbers(table.rows)
-    if place.geographic:
-        _require_ranges(xyz[:, :2], place.plan, table)
+    columns = place_columns(header, table.columns, _VOCABULARY, projected=projected, path=path, line=line)
+    xyz = columns.numbers(table.rows)
+    if columns.geographic:
+        _require_ranges(xyz[:, :2], columns.plan, table)
     time_s, zoneless = timestamps_of(table) if has_times(table.columns) else (None, False)
     attitudes, of_grid = _attitudes(table)
     return PoseTable(
@@ -134,17 +134,17 @@ def read_trajectory(path: Path, *, projected: bool = False) -> PoseTable:
         else None,
         time_s=time_s,
         xyz=xyz,
-        geographic=place.geographic,
+        geographic=columns.geographic,
         quat_xyzw=attitudes,
         attitudes_of_grid=of_grid,
         sigma_enu_m=_sigmas(table),
         zoneless_times=zoneless,
-        assumed_crs="EPSG:4979" if place.geographic and place.above_ellipsoid else None,
-        heights_above_geoid=place.above_geoid,
-        plan_unit_m=place.plan_unit_m,
-        height_unit_m=place.height_unit_m,
+        assumed_crs="EPSG:4979" if columns.geographic and columns.above_ellipsoid else None,
+        heights_above_geoid=columns.above_geoid,
+        plan_unit_m=columns.plan_unit_m,
+        height_unit_m=columns.height_unit_m,
         unknown_columns=table.unknown,
-        unread_columns=place.unread,
+        unread_columns=columns.unread,
         header_line=line,
     )
 

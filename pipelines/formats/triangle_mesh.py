@@ -76,7 +76,7 @@ def read_ply_mesh(path: Path) -> TriangleMesh:
     chunks = [chunk.position for chunk in cloud.chunks(1_000_000)]
     lines, _, size = ply_header(path)
     form = next(line[1] for line in lines if line[:1] == ["format"])
-    elements = [place for place, line in enumerate(lines) if line[:1] == ["element"]]
+    elements = [number for number, line in enumerate(lines) if line[:1] == ["element"]]
     second = lines[elements[1]] if len(elements) > 1 else []
     until = elements[2] if len(elements) > 2 else len(lines)
     if second[:2] != ["element", "face"] or not second[2:] or not second[2].isdecimal() or len(second[2]) > 12:
@@ -169,8 +169,8 @@ def _equal_faces(body: bytes, count: int, columns: list[_Column], order: str) ->
     for number, (_, _, length) in enumerate(columns):
         if length is not None and not (rows[f"n{number}"] == rows[f"v{number}"].shape[1]).all():
             return None
-    place = next(number for number, column in enumerate(columns) if column[0] in _CORNERS)
-    corners = rows[f"v{place}"].astype(np.int64)
+    column_number = next(number for number, column in enumerate(columns) if column[0] in _CORNERS)
+    corners = rows[f"v{column_number}"].astype(np.int64)
     return corners.ravel(), np.full(count, corners.shape[1], dtype=np.int64)
 
 
@@ -207,15 +207,15 @@ def read_obj(path: Path) -> TriangleMesh:
     """
     if file_size(path, limit_bytes=MOST_BYTES, kind="OBJ") == 0:
         raise InputError("file-empty", "The file is empty.", path=path)
-    place, corners, numbers = array.array("d"), array.array("q"), array.array("q")
+    position, corners, numbers = array.array("d"), array.array("q"), array.array("q")
     with reading(path), path.open("rb") as file:
         for number, line in enumerate(file, 1):
             try:
                 if line.startswith((b"v ", b"v\t")):
                     x, y, z = line.split(None, 4)[1:4]
-                    place.extend((float(x), float(y), float(z)))
+                    position.extend((float(x), float(y), float(z)))
                 elif line.startswith((b"f ", b"f\t")):
-                    known = len(place) // 3
+                    known = len(position) // 3
                     words = _whole_line(line, file).split()[1:]
                     indices = [int(word.partition(b"/")[0]) for word in words]
                     # A negative index counts from the last vertex so far; 1 is the first of all.
@@ -226,7 +226,7 @@ def read_obj(path: Path) -> TriangleMesh:
                 message = f"The line {text!r} is not one of an OBJ: {error}"
                 raise InputError("obj-line", message, path=path, line=number) from error
     shape = np.frombuffer(corners, np.int64), np.frombuffer(numbers, np.int64)
-    mesh = mesh_of(path, np.frombuffer(place).reshape(-1, 3), shape)
+    mesh = mesh_of(path, np.frombuffer(position).reshape(-1, 3), shape)
     return replace(mesh, states_axes=False)
 
 

@@ -170,8 +170,8 @@ def replacing_features_gpkg(path: Path, layers: Mapping[str, Sequence[Json]]) ->
                 values = [one["properties"].get(name) for one in features]
                 is_text = any(isinstance(value, str) for value in values)
                 columns[column] = np.array(values, dtype=object if is_text else np.float64)
-            found = [one["geometry"] for one in features]
-            shapes = [None if one is None else shapely.from_geojson(json.dumps(one)) for one in found]
+            geometries = [one["geometry"] for one in features]
+            shapes = [None if one is None else shapely.from_geojson(json.dumps(one)) for one in geometries]
             kinds = {shape.geom_type for shape in shapes if shape is not None}
             kind = f"{kinds.pop()} Z" if len(kinds) == 1 else "Unknown"
             _add_layer(draft, layer, shapes, columns, kind=kind, crs="EPSG:4979")

@@ -100,11 +100,11 @@ def _views(path: Path) -> list[str]:
 
 def _registered(base: sqlite3.Connection) -> set[str]:
     """Return the layers that a GeoPackage states, in small letters; its own tables are no views any more."""
-    found: set[str] = set()
+    tables: set[str] = set()
     for table in _OWN_TABLES[:2]:
         with contextlib.suppress(sqlite3.OperationalError):  # it lacks the table
-            found |= {str(name).lower() for (name,) in base.execute(f"SELECT table_name FROM {table}")}
-    return found
+            tables |= {str(name).lower() for (name,) in base.execute(f"SELECT table_name FROM {table}")}
+    return tables
 
 
 def _quoted(name: str) -> str:

@@ -49,13 +49,13 @@ class Xmp:
         `within` asks for the fields of one structure ("" for those of none), `namespace` for a part of the
         namespace's address.
         """
-        found = [
+        texts_of_name = [
             each.text
             for each in self.named(name)
             if (within is None or each.within.casefold() == within.casefold())
             and (namespace is None or namespace.casefold() in each.namespace.casefold())
         ]
-        return tuple(dict.fromkeys(found))
+        return tuple(dict.fromkeys(texts_of_name))
 
     def named(self, name: str) -> tuple[XmpProperty, ...]:
         """Return all properties of a name, in order, without regard to case."""
@@ -92,10 +92,10 @@ def number_of(text: str) -> float | None:
 
     Some programs write a comma for the decimal point, in the language of their user.
     """
-    found = _NUMBER.match(text)
-    if found is None or (found[2] is not None and float(found[2]) == 0.0):
+    match = _NUMBER.match(text)
+    if match is None or (match[2] is not None and float(match[2]) == 0.0):
         return None
-    value = float(with_decimal_point(found[1])) / float(found[2] or 1.0)
+    value = float(with_decimal_point(match[1])) / float(match[2] or 1.0)
     return value if math.isfinite(value) else None
 
 
@@ -153,10 +153,10 @@ def read_packet(packet: bytes) -> list[XmpProperty]:
 
 
 def _properties(root: Element) -> list[XmpProperty]:
-    found: list[XmpProperty] = []
+    properties: list[XmpProperty] = []
     # Element, and the two names around it: the property, and the structure that the property is in.
     stack: list[tuple[Element, tuple[str, str], str]] = [(root, ("", ""), "")]
-    while stack and len(found) < _MAX_PROPERTIES:
+    while stack and len(properties) < _MAX_PROPERTIES:
         element, around, within = stack.pop()
         space, name = _split(element.tag)
         # Lists and descriptions of RDF stand between a property and its values.
@@ -167,12 +167,12 @@ def _properties(root: Element) -> list[XmpProperty]:
         for key, text in element.attrib.items():
             attribute_space, attribute = _split(key)
             if attribute_space not in _NOT_NAMES and attribute not in _RDF_ATTRIBUTES:
-                found.append(XmpProperty(attribute_space, attribute, name, text[:_MAX_TEXT]))
+                properties.append(XmpProperty(attribute_space, attribute, name, text[:_MAX_TEXT]))
         text = (element.text or "").strip()
         if text and name and not len(element):
-            found.append(XmpProperty(space, name, within, text[:_MAX_TEXT]))
+            properties.append(XmpProperty(space, name, within, text[:_MAX_TEXT]))
         stack += [(child, (space, name), within) for child in reversed(element)]
-    return found
+    return properties
 
 
 def _split(tag: object) -> tuple[str, str]:

@@ -112,12 +112,12 @@ def _holds(code: int, points: FloatArray) -> bool:
 @cache
 def _register() -> list[tuple[str, int, bool]]:
     """Return plain names of EPSG's current systems, then aliases: with the code, and whether it is projected."""
-    found = []
+    names = []
     projected_of: dict[int, bool] = {}
     for kind in _PLANE:
         for info in query_crs_info(auth_name="EPSG", pj_types=kind):
             projected_of[int(info.code)] = kind is PJType.PROJECTED_CRS
-            found.append((info.name, int(info.code)))
+            names.append((info.name, int(info.code)))
     database = Path(get_data_dir()) / "proj.db"
     if database.is_file():
         query = (
@@ -125,8 +125,8 @@ def _register() -> list[tuple[str, int, bool]]:
             "('projected_crs', 'geodetic_crs')"
         )
         with closing(sqlite3.connect(f"{database.absolute().as_uri()}?immutable=1", uri=True)) as connection:
-            found += [(name, int(code)) for name, code in connection.execute(query) if int(code) in projected_of]
-    return [(_plain(name), code, projected_of[code]) for name, code in found]
+            names += [(name, int(code)) for name, code in connection.execute(query) if int(code) in projected_of]
+    return [(_plain(name), code, projected_of[code]) for name, code in names]
 
 
 def _plain(name: str) -> str:

@@ -165,8 +165,8 @@ def shared_error_factor(network: Network, residual: FloatArray) -> float:
     """
     factor = 1.0
     size = np.array([(camera.width, camera.height) for camera in network.cameras.values()], dtype=np.float64)
-    place = dict(zip(network.cameras, range(len(size)), strict=True))
-    of_image = size[[place[key] for key in network.camera_id.tolist()]]
+    row_of = dict(zip(network.cameras, range(len(size)), strict=True))
+    of_image = size[[row_of[key] for key in network.camera_id.tolist()]]
     part = np.clip(network.obs_xy_px / of_image[network.obs_image], 0.0, 1.0 - 1e-9)
     total = float((residual**2).sum())
     for columns, rows in _SHARED_GRIDS:

@@ -365,11 +365,11 @@ def nearest_points(
 ) -> NearestPoints:
     """Return the J = `count` points nearest to their rays (K,), weighted as in `NearestPoints` (eqs 4–9)."""
     across, weight = across_rays(direction), np.asarray(1.0 / sigma_rad**2)
-    found = NearestPoints(np.zeros((count, 3)), point, center, direction, sigma_rad)
+    nearest = NearestPoints(np.zeros((count, 3)), point, center, direction, sigma_rad)
     for _ in range(2):  # the first pass gives the distances, and so the weights
-        found = replace(found, position=meeting_points(point, center, across, count, weight=weight))
-        weight = found.weight
-    return found
+        nearest = replace(nearest, position=meeting_points(point, center, across, count, weight=weight))
+        weight = nearest.weight
+    return nearest
 
 
 def meeting_points(

@@ -145,7 +145,7 @@ def _fitted(camera: Camera, rays: FloatArray, pixels: FloatArray) -> Camera:
         return np.asarray(np.nan_to_num(off, nan=1e6, posinf=1e6, neginf=-1e6).ravel())
 
     try:
-        found = least_squares(residuals, np.zeros(len(unit)), x_scale="jac", max_nfev=_MOST_STEPS).x
+        fitted = least_squares(residuals, np.zeros(len(unit)), x_scale="jac", max_nfev=_MOST_STEPS).x
     except (ValueError, np.linalg.LinAlgError, InputError):  # no focal length above zero on the way
         return camera
-    return replace(camera, params=camera.params + unit * found)
+    return replace(camera, params=camera.params + unit * fitted)

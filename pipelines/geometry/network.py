@@ -96,14 +96,14 @@ def has_positive_depth(network: Network) -> BoolArray:
 
 def points_of_network(network: Network, rows: IntArray) -> Network:
     """Return the network of some points (P,), which are different ones, each with its whole track."""
-    place = np.full(len(network.point_in_world), -1)
-    place[rows] = np.arange(len(rows))
-    kept = np.flatnonzero(place[network.obs_point] >= 0)
-    kept = kept[np.argsort(place[network.obs_point[kept]], kind="stable")]
+    row_of = np.full(len(network.point_in_world), -1)
+    row_of[rows] = np.arange(len(rows))
+    kept = np.flatnonzero(row_of[network.obs_point] >= 0)
+    kept = kept[np.argsort(row_of[network.obs_point[kept]], kind="stable")]
     return replace(
         network,
         point_in_world=network.point_in_world[rows],
-        obs_point=place[network.obs_point[kept]],
+        obs_point=row_of[network.obs_point[kept]],
         obs_image=network.obs_image[kept],
         obs_xy_px=network.obs_xy_px[kept],
     )

@@ -28,10 +28,10 @@ def in_global_shutter(camera: Camera, xy_px: FloatArray, depth: FloatArray, trav
 
 def in_rolling_shutter(camera: Camera, xy_px: FloatArray, depth: FloatArray, travel: FloatArray) -> FloatArray:
     """Return pixels (K, 2) of a global shutter as the rolling shutter shows them; the inverse of the above."""
-    place = depth[:, None] * np.column_stack([undistort(camera, xy_px), np.ones(len(xy_px))])
+    point = depth[:, None] * np.column_stack([undistort(camera, xy_px), np.ones(len(xy_px))])
     seen = xy_px
     for _ in range(_STEPS):
-        moved = place - (seen[:, 1:] / camera.height - 0.5) * travel
+        moved = point - (seen[:, 1:] / camera.height - 0.5) * travel
         seen = distort(camera, moved[:, :2] / moved[:, 2:])
     return seen
 

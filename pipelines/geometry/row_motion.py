@@ -84,8 +84,8 @@ def with_row_motion(
     row = 2.0 * network.obs_xy_px[:, 1] / height - 1.0
     more = MoreColumns(row[:, None, None] * np.eye(2), residual_px)
     whole = eliminate_points(network, root_weight, more=more)
-    place = np.arange(8 * n).reshape(n, 8)
-    pose, motion = place[:, :6].ravel(), place[:, 6:].ravel()
+    index = np.arange(8 * n).reshape(n, 8)
+    pose, motion = index[:, :6].ravel(), index[:, 6:].ravel()
     every = whole.poses.tocsr()
     sums = EliminatedPoints(
         poses=bsr_matrix(every[pose][:, pose], blocksize=(6, 6)),

@@ -57,9 +57,9 @@ class SparseModel:
     def of_images(self, images: IntArray) -> SparseModel:
         """Return the model of some images (K,), in ascending order, with the points that two of them observe."""
         rows = np.unique(images)
-        place = np.full(len(self.image_name), -1)
-        place[rows] = np.arange(len(rows))
-        in_image = place[self.obs_image] >= 0
+        row_of = np.full(len(self.image_name), -1)
+        row_of[rows] = np.arange(len(rows))
+        in_image = row_of[self.obs_image] >= 0
         # Observations are sorted by point, then by image: an image may observe a point more than once.
         pairs = np.unique(np.column_stack([self.obs_point, self.obs_image])[in_image], axis=0)
         seen = np.bincount(pairs[:, 0], minlength=len(self.point_id)) >= 2
@@ -77,7 +77,7 @@ class SparseModel:
             point_rgb=self.point_rgb[points],
             point_error_px=self.point_error_px[points],
             obs_point=np.searchsorted(points, self.obs_point[kept]),
-            obs_image=place[self.obs_image[kept]],
+            obs_image=row_of[self.obs_image[kept]],
             obs_xy_px=self.obs_xy_px[kept],
             travel_in_cam=None if self.travel_in_cam is None else self.travel_in_cam[rows],
         )

@@ -67,9 +67,9 @@ def chi2_quantile(probability: float, degrees: ArrayLike) -> FloatArray:
     from scipy.special import gammaincinv
 
     dof = np.asarray(degrees)
-    distinct, place = np.unique(dof, return_inverse=True)
+    distinct, index = np.unique(dof, return_inverse=True)
     values = np.where(distinct > 0, 2.0 * gammaincinv(np.maximum(distinct, 1) / 2.0, probability), 0.0)
-    return np.asarray(values[place].reshape(dof.shape), dtype=np.float64)
+    return np.asarray(values[index].reshape(dof.shape), dtype=np.float64)
 
 
 def chi2_probability_above(value: float, degrees: float) -> float:
@@ -109,11 +109,11 @@ def spatial_median(points: ArrayLike) -> FloatArray:
     coordinate.
     """
     array = np.asarray(points, dtype=np.float64)
-    place = np.median(array, axis=0)
+    median = np.median(array, axis=0)
     for _ in range(_WEISZFELD_STEPS):
-        weight = 1.0 / np.maximum(np.linalg.norm(array - place, axis=1), _WEISZFELD_NEAR)
-        place = weight @ array / weight.sum()
-    return np.asarray(place)
+        weight = 1.0 / np.maximum(np.linalg.norm(array - median, axis=1), _WEISZFELD_NEAR)
+        median = weight @ array / weight.sum()
+    return np.asarray(median)
 
 
 def squared_mahalanobis(residuals: ArrayLike, covariances: ArrayLike) -> FloatArray:

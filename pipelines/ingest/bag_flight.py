@@ -54,9 +54,9 @@ def read_bag(
         streams = read_streams(bag, options, remarks, progress)
         beside = cameras_beside(streams, remarks) if options.sensor == ALL_SENSORS else ()
         positions, vertical = _positions(streams, options, remarks)
-        place = positions.at(streams.camera.images.time_s + options.time_offset_s).position
+        position = positions.at(streams.camera.images.time_s + options.time_offset_s).position
         photos, numbers = write_photos(
-            bag, streams.camera.images, place, options=options, folder=folder, remarks=remarks, progress=progress
+            bag, streams.camera.images, position, options=options, folder=folder, remarks=remarks, progress=progress
         )
         if len(photos) > _MANY_FRAMES and options.every is None:
             remarks.warn(

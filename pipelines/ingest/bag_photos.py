@@ -273,7 +273,7 @@ def cameras_beside(streams: BagStreams, remarks: Remarks) -> tuple[CameraBeside,
         InputError: there is none.
     """
     reference = streams.camera.images
-    found = []
+    cameras = []
     for camera in streams.others:
         images = camera.images
         if images.frame == reference.frame != UNNAMED_FRAME:
@@ -299,8 +299,8 @@ def cameras_beside(streams: BagStreams, remarks: Remarks) -> tuple[CameraBeside,
                 "its rig, and is left out.",
             )
             continue
-        found.append(CameraBeside(camera, message, quat))
-    if not found:
+        cameras.append(CameraBeside(camera, message, quat))
+    if not cameras:
         reasons = "".join(f" {warning.sentence}" for warning in remarks.warnings if "bag-camera" in warning.code)
         raise InputError(
             "no-rig",
@@ -310,7 +310,7 @@ def cameras_beside(streams: BagStreams, remarks: Remarks) -> tuple[CameraBeside,
             path=streams.path,
             field="--sensor",
         )
-    return tuple(found)
+    return tuple(cameras)
 
 
 def _partners(

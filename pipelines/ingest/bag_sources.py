@@ -124,9 +124,9 @@ def _apart(best: _Receiver, other: _Receiver) -> tuple[float, float] | None:
     if not inside.any():
         return None
     origin = Origin(lat_deg=own[0, 1], lon_deg=own[0, 2], alt_m=own[0, 3])
-    place = enu_from_ecef(ecef_from_lla(own[order, 1:]), origin)
+    position = enu_from_ecef(ecef_from_lla(own[order, 1:]), origin)
     there: FloatArray = enu_from_ecef(ecef_from_lla(its[inside, 1:]), origin)
-    at = np.column_stack([np.interp(its[inside, 0], own[order, 0], place[:, axis]) for axis in range(3)])
+    at = np.column_stack([np.interp(its[inside, 0], own[order, 0], position[:, axis]) for axis in range(3)])
     shift = np.median(there - at, axis=0)
     return float(math.hypot(*shift[:2])), float(shift[2])
 
@@ -163,12 +163,12 @@ def clock_shifts(ahead_s: Mapping[str, float], at_s: float) -> dict[str, ClockSh
     if not ahead_s:
         return {}
     nearest = min(ahead_s, key=lambda topic: (abs(ahead_s[topic]), topic))
-    found = {}
+    shifts = {}
     for topic, ahead in ahead_s.items():
         apart = ahead - ahead_s[nearest]
         if abs(apart) > _APART_S:
-            found[topic] = _explained(topic, nearest, apart, at_s + apart)
-    return found
+            shifts[topic] = _explained(topic, nearest, apart, at_s + apart)
+    return shifts
 
 
 def _explained(topic: str, other: str, apart_s: float, at_s: float) -> ClockShift:

@@ -122,12 +122,12 @@ def _choice_of_camera(images: list[BagTopic]) -> Remark | None:
 
 def _other_cameras(bag: Bag, images: list[BagTopic], chosen: str) -> tuple[tuple[str, str | None], ...]:
     """Return the first image topic of each other camera, and its `CameraInfo`."""
-    found: dict[str, tuple[str, str | None]] = {}
+    cameras: dict[str, tuple[str, str | None]] = {}
     for topic in images:
         camera = camera_of_topic(topic.name)
         if not _is_no_photo(topic) and camera != camera_of_topic(chosen):
-            found.setdefault(camera, (topic.name, _info_beside(bag, topic.name)))
-    return tuple(found.values())
+            cameras.setdefault(camera, (topic.name, _info_beside(bag, topic.name)))
+    return tuple(cameras.values())
 
 
 def _of(bag: Bag, types: Container[str]) -> list[BagTopic]:

@@ -47,13 +47,13 @@ def photos_of_rig(
     if not photos:
         return photos, (), {}
     if config is not None:
-        kept, found, rotations = _by_rig_file(photos, config)
+        kept, companions, rotations = _by_rig_file(photos, config)
     elif sensor == ALL_SENSORS:
         kept, rotations = chosen_sensor(photos, None, Remarks()), {}
-        found = exposed_together(photos, kept)
+        companions = exposed_together(photos, kept)
     else:
         return chosen_sensor(photos, sensor, remarks), (), {}
-    if not found:
+    if not companions:
         raise InputError(
             "no-rig",
             (
@@ -63,8 +63,8 @@ def photos_of_rig(
             field="--sensor" if config is None else "--rig",
             remedy="Give --rig with the names, or one sensor by --sensor.",
         )
-    note_rig(photos, kept, found, remarks)
-    return kept, found, rotations
+    note_rig(photos, kept, companions, remarks)
+    return kept, companions, rotations
 
 
 def exposed_together(photos: Sequence[Photo], reference: Sequence[Photo]) -> tuple[Accompanying, ...]:
@@ -79,11 +79,11 @@ def exposed_together(photos: Sequence[Photo], reference: Sequence[Photo]) -> tup
     for key in (_capture, _name):
         members: dict[tuple[str, ...], list[Photo]] = {}
         for photo in reference:
-            if (found := key(photo)) is not None:
-                members.setdefault(found, []).append(photo)
+            if (instant := key(photo)) is not None:
+                members.setdefault(instant, []).append(photo)
         for photo in others:
-            found = key(photo)
-            candidates = members.get(found, []) if found is not None and photo.name not in beside else []
+            instant = key(photo)
+            candidates = members.get(instant, []) if instant is not None and photo.name not in beside else []
             near = [each for each in candidates if _apart_s(each, photo) <= _TOGETHER_BY_NAME_S]
             if len(near) == 1:
                 beside[photo.name] = near[0].name
@@ -110,10 +110,10 @@ def _apart_s(one: Photo, other: Photo, unknown: float = 0.0) -> float:
     return unknown if first is None or second is None else abs(first - second)
 
 
-def _sound(found: Iterable[Accompanying]) -> tuple[Accompanying, ...]:
+def _sound(companions: Iterable[Accompanying]) -> tuple[Accompanying, ...]:
     """Return those with one photograph for each lens and instant, of lenses with instants enough."""
     single: dict[tuple[str, str], Accompanying] = {}
-    for each in found:
+    for each in companions:
         single.setdefault((each.photo.sensor, each.beside), each)
     count = Counter(sensor for sensor, _ in single)
     return tuple(each for (sensor, _), each in single.items() if count[sensor] >= FEWEST_INSTANTS)
@@ -161,11 +161,11 @@ def _lens_name(prefix: str) -> str:
 
 
 def note_rig(
-    photos: Sequence[Photo], reference: Sequence[Photo], found: Sequence[Accompanying], remarks: Remarks
+    photos: Sequence[Photo], reference: Sequence[Photo], companions: Sequence[Accompanying], remarks: Remarks
 ) -> None:
     """Note the lenses of a rig, and warn of photographs of its other lenses that stay alone."""
-    count = Counter(each.photo.sensor or VISIBLE for each in found)
-    instants = len({each.beside for each in found})
+    count = Counter(each.photo.sensor or VISIBLE for each in companions)
+    instants = len({each.beside for each in companions})
     lenses = ", ".join(f"{sensor} ({number})" for sensor, number in count.items())
     main = ", ".join(sorted({photo.sensor or VISIBLE for photo in reference}))
     remarks.assume(
@@ -174,7 +174,7 @@ def note_rig(
         f"{lenses}. It has one pose at each instant, and the poses of the lenses in it are estimated. The splat is "
         "trained from the reference lens.",
     )
-    used = {photo.name for photo in reference} | {each.photo.name for each in found}
+    used = {photo.name for photo in reference} | {each.photo.name for each in companions}
     remarks.warn_counted(
         "rig-photograph-alone",
         sorted(photo.name for photo in photos if photo.name not in used),

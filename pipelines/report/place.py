@@ -119,8 +119,8 @@ def place_facts(survey: Survey, solution: Solution, scene: FloatArray, crs: Targ
 
 def named_places(points: tuple[SurveyedPoint, ...]) -> NamedPlaces:
     """Return the plan positions (N, 2) of surveyed points in `geo`, in metres, with their names."""
-    place = np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]
-    return NamedPlaces(place, [point.name for point in points])
+    plan = np.array([point.position_in_geo for point in points]).reshape(-1, 3)[:, :2]
+    return NamedPlaces(plan, [point.name for point in points])
 
 
 def _axes(names: tuple[str, ...], units: tuple[str, ...], values: FloatArray) -> tuple[AxisExtent, ...]:

@@ -242,13 +242,13 @@ class DeliveredFacts:
 def delivered_facts(workspace: Workspace) -> DeliveredFacts:
     """Return the delivered files that there are, hashed as they lie on the disk."""
     folders = {BY_NAME[name].folder: name for name in _STAGES}
-    found = []
+    files = []
     for path, description in DESCRIPTIONS.items():
         stage = folders.get(path.partition("/")[0])
         if stage is not None and (workspace.root / path).exists():
             values = _values(workspace, stage)
-            found.append(_file(workspace.root / path, path, description, values))
-    return DeliveredFacts(tuple(found))
+            files.append(_file(workspace.root / path, path, description, values))
+    return DeliveredFacts(tuple(files))
 
 
 def measured_share(workspace: Workspace) -> tuple[float, float] | None:

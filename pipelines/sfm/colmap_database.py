@@ -168,12 +168,12 @@ def drop_added_features(path: Path) -> None:
 
 def verified_matches(colmap: ModuleType, path: Path) -> dict[tuple[int, int], int]:
     """Return the numbers of verified matches of the pairs of a database: indices i < j of the survey's images."""
-    found = {}
+    matches = {}
     with colmap.Database.open(path) as database:
         for pair, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
             first, second = sorted(colmap.pair_id_to_image_pair(pair))
-            found[first - 1, second - 1] = int(count)
-    return found
+            matches[first - 1, second - 1] = int(count)
+    return matches
 
 
 def finish_database(draft: Path, final: Path, *, without: Iterable[str] = ()) -> None:

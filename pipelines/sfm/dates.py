@@ -341,8 +341,8 @@ class _BothDates:
     def _pairs(self, job: SfmJob, neighbours: int) -> list[tuple[int, int]]:
         """Return the pairs that may show the same place, by the numbers of their images."""
         ids = self.date.sfm.image_id
-        found = pairs_across(job.survey, self.later, self.date, neighbours)
-        return [(a, self.first + int(ids[b])) for a, b in found]
+        pairs = pairs_across(job.survey, self.later, self.date, neighbours)
+        return [(a, self.first + int(ids[b])) for a, b in pairs]
 
     def _match(
         self, colmap: ModuleType, job: SfmJob, pairs: list[tuple[int, int]], progress: Progress, *, loosely: bool
@@ -415,21 +415,21 @@ class _BothDates:
         home, survey = self.date.workspace, self.date.survey
         folder, masks = photograph_folder(home, survey.image_dir), masks_beside(str(home.path(SURVEY)), survey)
         there = SfmJob(survey, folder, home.path(DATABASE), job.options, masks)
-        found: dict[int, tuple[SfmJob, SurveyImage]] = {}
+        photographs: dict[int, tuple[SfmJob, SurveyImage]] = {}
         for first, model, date in ((0, self.later, job), (self.first, self.earlier, there)):
             image = {each.name: each for each in date.survey.images}
             known = {number: model.images[number].name for number in model.reg_image_ids()}
-            found |= {first + number: (date, image[name]) for number, name in known.items() if name in image}
-        return found
+            photographs |= {first + number: (date, image[name]) for number, name in known.items() if name in image}
+        return photographs
 
     def _ties(self, colmap: ModuleType, pairs: list[tuple[int, int]]) -> _Ties:
         """Return the tracks that the verified matches of some pairs tie."""
         votes: Counter[tuple[int, int]] = Counter()
         with colmap.Database.open(self.path) as database:
-            found = [self._tied(database, a, b) for a, b in pairs if database.exists_two_view_geometry(a, b)]
-        for of_pair, _ in found:
+            ties = [self._tied(database, a, b) for a, b in pairs if database.exists_two_view_geometry(a, b)]
+        for of_pair, _ in ties:
             votes.update(of_pair)
-        return _one_to_one(votes, sum(matches for _, matches in found), len(pairs))
+        return _one_to_one(votes, sum(matches for _, matches in ties), len(pairs))
 
     def _tied(self, database: ColmapDatabase, a: int, b: int) -> tuple[set[tuple[int, int]], int]:
         """Return the pairs of points (later, earlier) that two images tie, and their number of verified matches."""
@@ -500,14 +500,14 @@ def _both_dates(
 
 def _added_features(colmap: ModuleType, path: Path) -> dict[int, FloatArray]:
     """Return the places (n, 2) of features without SIFT's descriptors, by the numbers of images that have some."""
-    found = {}
+    features = {}
     with colmap.Database.open(path) as database:
         for image in database.read_all_images():
             number = image.image_id
             sift = database.num_descriptors_for_image(number)
             if database.num_keypoints_for_image(number) > sift:
-                found[number] = np.asarray(database.read_keypoints(number), dtype=np.float64)[sift:, :2]
-    return found
+                features[number] = np.asarray(database.read_keypoints(number), dtype=np.float64)[sift:, :2]
+    return features
 
 
 def _write_images(

@@ -59,20 +59,20 @@ def foreign_file(path: Path) -> ForeignFile | None:
     """
     if path.is_dir():
         inside = (_recognised(candidate) for candidate in _candidates(path))
-        return next((found for found in inside if found is not None), None)
+        return next((file for file in inside if file is not None), None)
     if not path.exists() or path.name in _COLMAP_FILES:
         return None
-    found = _recognised(path)
-    if found is None:
+    file = _recognised(path)
+    if file is None:
         kind = _ADVICE.get(path.suffix.lower(), _kind(path))
         message = f"The file has no cameras that can be imported: it is {kind}. These are read: {_READABLE}."
         raise InputError("not-solved-cameras", message, path=path)
-    return found
+    return file
 
 
 def _candidates(folder: Path) -> Iterator[Path]:
     for place in _PLACES:
-        yield from (found for found in sorted(folder.glob(place)) if found.is_file())
+        yield from (file for file in sorted(folder.glob(place)) if file.is_file())
 
 
 def _recognised(path: Path) -> ForeignFile | None:

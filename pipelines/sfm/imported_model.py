@@ -178,8 +178,8 @@ def _photo_size(survey: Survey, source: Path) -> PhotoSize:
     names, sizes = ImageNames(image.name for image in survey.images), _photo_sizes(survey)
 
     def photo_size(name: str) -> tuple[int, int] | None:
-        found = names.find(_relative(name), path=source) if name.strip() else None
-        return None if found is None else sizes[found]
+        photograph = names.find(_relative(name), path=source) if name.strip() else None
+        return None if photograph is None else sizes[photograph]
 
     return photo_size
 
@@ -200,17 +200,17 @@ def _rename(model: Reconstruction, survey: Survey, folder: Path, warn: Callable[
     foreign, renamed = [], []
     for image_id in sorted(model.reg_image_ids()):
         image = model.images[image_id]
-        found = names.find(_relative(image.name), path=folder)
-        if found is None:
+        photograph = names.find(_relative(image.name), path=folder)
+        if photograph is None:
             foreign.append(image)
             continue
-        if found in taken:
-            message = f"{taken[found]!r} and {image.name!r} of the model are both the photograph {found}."
+        if photograph in taken:
+            message = f"{taken[photograph]!r} and {image.name!r} of the model are both the photograph {photograph}."
             raise InputError("image-twice", message, path=folder, field="images")
-        taken[found] = image.name
-        if image.name != found:
-            renamed.append(f"{image.name} is {found}")
-            image.name = found
+        taken[photograph] = image.name
+        if image.name != photograph:
+            renamed.append(f"{image.name} is {photograph}")
+            image.name = photograph
     if renamed:
         warn(
             "%d images of the model have another folder, case or suffix than their photographs (%s).",
@@ -280,8 +280,8 @@ def find_model(path: Path) -> Path:
 
 def _numbered(parent: Path) -> list[Path]:
     """Return the folders of numbered models in a folder, by number."""
-    found = {file.parent for name in _IMAGES for file in parent.glob(f"[0-9]*/{name}")}
-    return sorted(found, key=lambda folder: (len(folder.name), folder.name))
+    folders = {file.parent for name in _IMAGES for file in parent.glob(f"[0-9]*/{name}")}
+    return sorted(folders, key=lambda folder: (len(folder.name), folder.name))
 
 
 def _number_of_images(folder: Path) -> int:

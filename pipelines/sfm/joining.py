@@ -75,18 +75,18 @@ def _join_some(
         images = sorted(set(part.reg_image_ids()) - set(whole.reg_image_ids()))
         if not images:
             continue
-        found = _tied(colmap, job, whole, part)
-        if isinstance(found, str):
-            log.info("A part of %d photographs is not joined: %s.", len(images), found)
+        join = _tied(colmap, job, whole, part)
+        if isinstance(join, str):
+            log.info("A part of %d photographs is not joined: %s.", len(images), join)
             continue
         moved, joined = type(part)(part), type(whole)(whole)
-        moved.transform(colmap.Sim3d(found.model_from_part.matrix()[:3]))
+        moved.transform(colmap.Sim3d(join.model_from_part.matrix()[:3]))
         add_part(colmap, joined, moved)
         if _settle(colmap, job, joined, images) < _FEWEST_SHARED:
             log.info("A part of %d photographs shares too few points with the model when adjusted.", len(images))
             continue
         whole = joined
-        joins.append(Join(tuple(images), found))
+        joins.append(Join(tuple(images), join))
         task.advance(len(images))
     return whole, joins
 
@@ -108,7 +108,7 @@ def _pairs_across(colmap: ModuleType, database: Path, whole: Reconstruction, par
     """
     inside = set(whole.reg_image_ids())
     outside = None if part is None else set(part.reg_image_ids()) - inside
-    found: Pairs = {}
+    pairs: Pairs = {}
     with colmap.Database.open(database) as opened:
         for pair, count in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
             if count < _FEWEST_MATCHES:
@@ -117,8 +117,8 @@ def _pairs_across(colmap: ModuleType, database: Path, whole: Reconstruction, par
             for one, other in ((first, second), (second, first)):
                 if other in inside and one not in inside and (outside is None or one in outside):
                     rows = np.asarray(opened.read_two_view_geometry(one, other).inlier_matches, dtype=np.int64)
-                    found[one, other] = rows
-    return found
+                    pairs[one, other] = rows
+    return pairs
 
 
 def _models_apart(colmap: ModuleType, job: SfmJob, whole: Reconstruction) -> list[Any]:

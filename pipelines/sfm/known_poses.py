@@ -71,20 +71,20 @@ def _limit_px(model: Reconstruction, matches: Matches) -> float:
 
 def _without_points(model: Reconstruction, matches: int, pairs: int) -> DegenerateGeometryError:
     """Return the error of poses that give hardly a point: the photographs or the poses are the cause."""
-    found = f"{model.num_points3D()} points could be triangulated from the imported poses"
+    triangulated = f"{model.num_points3D()} points could be triangulated from the imported poses"
     if matches < _LEAST_POINTS:
         return DegenerateGeometryError(
             "no-matches",
             (
-                f"{found}: {matches} verified matches were found between the {model.num_images()} "
+                f"{triangulated}: {matches} verified matches were found between the {model.num_images()} "
                 "photographs. They do not show the same ground, or it lacks texture; poses play no part in that."
             ),
             remedy="Check that the photographs overlap, and are those of the model.",
         )
     return DegenerateGeometryError(
         "no-points-triangulated",
-        f"{found}, although {matches} matches were found in {pairs} pairs of photographs: the poses or the focal "
-        "length are too inaccurate. Reconstruct without --import.",
+        f"{triangulated}, although {matches} matches were found in {pairs} pairs of photographs: the poses or the "
+        "focal length are too inaccurate. Reconstruct without --import.",
     )
 
 
@@ -121,17 +121,17 @@ def _with_numbers_of(colmap: ModuleType, imported: Reconstruction, database: Pat
 def _matches(colmap: ModuleType, model: Reconstruction, database: Path) -> Matches:
     """Return pixels of the verified matches between the posed images, by rows of the flat model."""
     row_of = {int(image_id): row for row, image_id in enumerate(sorted(model.reg_image_ids()))}
-    found = {}
+    matches = {}
     with colmap.Database.open(database) as opened:
         keypoints = {image_id: np.asarray(opened.read_keypoints(image_id))[:, :2] for image_id in row_of}
         for (first, second), geometry in _geometries(colmap, opened):
             if first in row_of and second in row_of and len(geometry.inlier_matches):
                 pairs = np.asarray(geometry.inlier_matches)
-                found[row_of[first], row_of[second]] = (
+                matches[row_of[first], row_of[second]] = (
                     keypoints[first][pairs[:, 0]].astype(np.float64),
                     keypoints[second][pairs[:, 1]].astype(np.float64),
                 )
-    return found
+    return matches
 
 
 def _geometries(colmap: ModuleType, opened: ColmapDatabase) -> list[tuple[tuple[int, int], Any]]:

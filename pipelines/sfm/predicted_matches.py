@@ -172,7 +172,7 @@ def _outside(model: Reconstruction, survey: Survey, prediction: _Prediction) -> 
     """Return predicted cameras, in the model's frame, of photographs that are not in it, by COLMAP's numbers."""
     inside = set(model.reg_image_ids())
     back = prediction.geo_from_model.inverse()
-    found = {}
+    views = {}
     for key, image in enumerate(survey.images, start=1):
         if (
             key in inside
@@ -187,8 +187,8 @@ def _outside(model: Reconstruction, survey: Survey, prediction: _Prediction) -> 
             prediction.boresight[image.camera_id]
         )
         rotation = geo_from_cam.T @ prediction.geo_from_model.rotation
-        found[key] = _View(lens_of_colmap(model.cameras[image.camera_id]), rotation, back.apply(position[None])[0])
-    return found
+        views[key] = _View(lens_of_colmap(model.cameras[image.camera_id]), rotation, back.apply(position[None])[0])
+    return views
 
 
 def _model_photograph(model: Reconstruction, key: int) -> _ModelPhotograph:
@@ -287,13 +287,13 @@ def _matched(features: _Features, theirs: _Features, where: _Where) -> IntArray:
     wanted_size, wanted_turn = np.linalg.norm(where.axis_px, axis=1), _angle(where.axis_px)
     mine, other, apart = [], [], []
     for row, near in zip(rows, tree.query_ball_point(where.xy_px[rows], where.radius_px[rows]), strict=True):
-        found = np.array(near, dtype=np.int64)
-        ratio = size[found] / max(wanted_size[row], 1e-9)
-        turned = np.abs((turn[found] - wanted_turn[row] + np.pi) % (2 * np.pi) - np.pi)
-        found = found[(ratio < _MOST_FACTOR) & (ratio > 1 / _MOST_FACTOR) & (turned < _MOST_TURN_RAD)]
-        cosine = features.descriptor[found] @ theirs.descriptor[row]
-        mine.append(found)
-        other.append(np.full(len(found), row))
+        candidates = np.array(near, dtype=np.int64)
+        ratio = size[candidates] / max(wanted_size[row], 1e-9)
+        turned = np.abs((turn[candidates] - wanted_turn[row] + np.pi) % (2 * np.pi) - np.pi)
+        candidates = candidates[(ratio < _MOST_FACTOR) & (ratio > 1 / _MOST_FACTOR) & (turned < _MOST_TURN_RAD)]
+        cosine = features.descriptor[candidates] @ theirs.descriptor[row]
+        mine.append(candidates)
+        other.append(np.full(len(candidates), row))
         apart.append(np.sqrt(np.maximum(2 - 2 * cosine, 0)))
     one, two, distance = np.concatenate(mine), np.concatenate(other), np.concatenate(apart)
     forth = _unique_best(one, two, distance, theirs.xy_px)

@@ -109,7 +109,7 @@ def _lenses(model: Reconstruction, survey: Survey) -> dict[int, _Lens]:
     references: dict[int, Counter[int]] = {}
     for each in survey.companions:
         references.setdefault(each.camera_id, Counter())[camera[each.beside]] += 1
-    found = {}
+    lenses = {}
     for lens, counts in references.items():
         reference = counts.most_common(1)[0][0]
         pairs = [
@@ -131,8 +131,8 @@ def _lenses(model: Reconstruction, survey: Survey) -> dict[int, _Lens]:
                 len(poses), lens, shared, extra={"code": "rig-lens-open"},
             )  # fmt: skip
             continue
-        found[lens] = _Lens(reference, *_mean(np.array(poses)))
-    return found
+        lenses[lens] = _Lens(reference, *_mean(np.array(poses)))
+    return lenses
 
 
 def _inverse(pose: FloatArray) -> FloatArray:

@@ -27,12 +27,12 @@ def unregistered(colmap: ModuleType, database: Path, model: Reconstruction, reme
         lost = sorted(set(names) - set(inside), key=lambda image_id: names[image_id])
         matches: dict[int, dict[int, int]] = {image_id: {} for image_id in lost}
         shared: dict[int, dict[int, int]] = {image_id: {} for image_id in lost}
-        for pair, found in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
+        for pair, inliers in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
             first, second = colmap.pair_id_to_image_pair(pair)
             for one, other in ((first, second), (second, first)):
-                if one not in matches or not found:
+                if one not in matches or not inliers:
                     continue
-                matches[one][other] = int(found)
+                matches[one][other] = int(inliers)
                 if other in inside:
                     rows = np.asarray(opened.read_two_view_geometry(one, other).inlier_matches)[:, 1]
                     # A model of an earlier round lacks the features that were added to the database after it.

@@ -101,7 +101,7 @@ class Recording:
 
 
 def _receiver(options: SimulateOptions) -> flight.Receiver:
-    asked: dict[str, Any] = {
+    overrides: dict[str, Any] = {
         "sigma_h_m": options.sigma_h,
         "sigma_v_m": options.sigma_v,
         "bias_m": options.bias,
@@ -110,7 +110,7 @@ def _receiver(options: SimulateOptions) -> flight.Receiver:
         "outlier_share": options.outlier_share,
         "outlier_m": options.outlier_size,
     }
-    given = {name: value for name, value in asked.items() if value is not None}
+    given = {name: value for name, value in overrides.items() if value is not None}
     return replace(flight.RECEIVERS[options.gnss], **given)
 
 

@@ -64,16 +64,16 @@ def compilation_stamp(module: str) -> Path:
 
 @cache
 def _digest(module: Path) -> str:
-    found, open_ = {module}, [module]
+    modules, open_ = {module}, [module]
     while open_:
         for name, members in _IMPORTS.findall(open_.pop().read_text(encoding="utf-8")):
             place = _HOME.joinpath(*name.split("."))
             files = [place.with_suffix(".py"), *(place / f"{one}.py" for one in re.findall(r"\w+", members))]
-            new = {file for file in files if file.is_file()} - found
-            found |= new
+            new = {file for file in files if file.is_file()} - modules
+            modules |= new
             open_ += new
     digest = hashlib.sha256()
-    for file in sorted(found):
+    for file in sorted(modules):
         digest.update(f"{os.path.relpath(file, _HOME)}\n".encode())
         digest.update(file.read_bytes())
     return digest.hexdigest()[:16]

@@ -69,19 +69,21 @@ def fill_cells(
         return FilledCells(height, sigma, distance, own)
     angle = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     directions = np.column_stack([np.sin(angle), np.cos(angle)])
-    low, square, near, missing, source = _looked(height, np.column_stack([rows, columns]), directions, reach)
-    filled, found = height.copy(), np.isfinite(low)
+    low, square, near, missing, source = _heights_around(
+        height, np.column_stack([rows, columns]), directions, reach
+    )
+    filled, known = height.copy(), np.isfinite(low)
     filled[rows, columns] = low
     close, far = _smoothed(filled, _SMOOTHED)[rows, columns], _smoothed(filled, _SMOOTHED_FAR)[rows, columns]
     share = np.clip(near / _FAR, 0.0, 1.0)
-    filled[rows, columns] = np.where(found, (1 - share) * close + share * far, np.nan)
+    filled[rows, columns] = np.where(known, (1 - share) * close + share * far, np.nan)
     distance[rows, columns] = near
     if with_sigma:
         relief = filled if modelled is None else np.where(empty & np.isfinite(modelled), modelled, filled)
         unknown = missing * np.interp(near, *_variogram(height))
         variance = _SQUARE * square + _scatter(relief)[rows, columns] + unknown
         sigma[rows, columns] = np.sqrt(variance)
-    own[rows, columns] = np.where(found, source, own[rows, columns])
+    own[rows, columns] = np.where(known, source, own[rows, columns])
     return FilledCells(filled, sigma, distance, own)
 
 
@@ -124,7 +126,7 @@ def _scatter(height: FloatArray) -> FloatArray:
 
 
 @kernel(nogil=True, parallel=True, error_model="numpy")
-def _looked(
+def _heights_around(
     height: FloatArray,  # (H, W) float64
     cells: IntArray,  # (C, 2) int64
     directions: FloatArray,  # (D, 2) float64

@@ -63,10 +63,10 @@ def chosen_pixels(
         limits: of the pixels.
     """
     window = (limits.reach_px, limits.step, limits.look_px)
-    found: tuple[FloatArray, FloatArray, ByteArray, FloatArray] = _chosen(
+    pixels: tuple[FloatArray, FloatArray, ByteArray, FloatArray] = _chosen(
         depth, rgb, intrinsics_px, turn, center, scale, box, window, limits.bend, limits.grazing, limits.coarsest_m
     )
-    return found
+    return pixels
 
 
 @njit(nogil=True, error_model="numpy")

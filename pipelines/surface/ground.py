@@ -147,11 +147,11 @@ def _on_cloth(points: FloatArray, knot_m: float, limit_m: float) -> IntArray:
         cloth.params.bSloopSmooth = True  # without it, one in seven ground points on a slope of 15 % is missed
         cloth.params.cloth_resolution, cloth.params.class_threshold = knot_m, limit_m
         cloth.params.rigidness, cloth.params.interations = _RIGIDNESS, _ITERATIONS
-        found, others = CSF.VecInt(), CSF.VecInt()
+        ground, others = CSF.VecInt(), CSF.VecInt()
         with _silenced():
             cloth.setPointCloud(points[around])
-            cloth.do_filtering(found, others, False)
-        chosen.append(np.intersect1d(around[np.array(found, dtype=np.int64)], rows))
+            cloth.do_filtering(ground, others, False)
+        chosen.append(np.intersect1d(around[np.array(ground, dtype=np.int64)], rows))
     return np.sort(np.concatenate(chosen)) if chosen else np.zeros(0, np.int64)
 
 

@@ -104,12 +104,12 @@ def measured_ground(
         except InputError as error:
             log.warning("%s; it is made again", error)
     model = solution if isinstance(solution, TrainedModel) else read_trained(workspace)
-    found = measured_by(model_renderer(workspace, model, sfm, survey, progress=progress), progress)
+    measured = measured_by(model_renderer(workspace, model, sfm, survey, progress=progress), progress)
     try:
-        found.save(path)
+        measured.save(path)
     except OSError as error:  # found again next time
         log.warning("%s cannot be written: %s", path, error.strerror)
-    return found
+    return measured
 
 
 def _key(solution: Solution, workspace: Workspace) -> str:

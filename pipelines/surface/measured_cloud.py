@@ -298,8 +298,8 @@ def _thinned(parts: list[MeasuredCloud], voxel_m: float) -> MeasuredCloud:
 
 def _short_name(name: str) -> str:
     """Return the name that a WKT gives its CRS; any other text itself."""
-    found = re.match(r'\w+\["([^"]+)"', name)
-    return found[1] if found else name
+    match = re.match(r'\w+\["([^"]+)"', name)
+    return match[1] if match else name
 
 
 @contextmanager
@@ -321,10 +321,10 @@ def _remarks_text(remarks: Sequence[Remark]) -> str:
 
 
 def _by_code(remarks: Sequence[Remark]) -> list[list[Remark]]:
-    found: dict[str, list[Remark]] = {}
+    remarks_of: dict[str, list[Remark]] = {}
     for remark in remarks:
-        found.setdefault(remark.code, []).append(remark)
-    return list(found.values())
+        remarks_of.setdefault(remark.code, []).append(remark)
+    return list(remarks_of.values())
 
 
 def _few(remarks: Sequence[Remark]) -> tuple[Remark, ...]:

@@ -55,8 +55,8 @@ def distances_from_mesh(points: FloatArray, mesh: RawMesh, step_m: float) -> Flo
     tree = KDTree(np.einsum("nk,nkj->nj", weights, corners[face]), balanced_tree=False)
     _, near = tree.query(points, k=min(_NEAR_FACES, len(face)), workers=-1)
     near = np.reshape(near, (len(points), -1))
-    found = [np.linalg.norm(closest_point(corners[face[column]], points) - points, axis=1) for column in near.T]
-    return np.asarray(np.min(found, axis=0))
+    distances = [np.linalg.norm(closest_point(corners[face[column]], points) - points, axis=1) for column in near.T]
+    return np.asarray(np.min(distances, axis=0))
 
 
 def without_islands(mesh: RawMesh, least_m2: float) -> tuple[RawMesh, int]:

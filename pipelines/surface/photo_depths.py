@@ -69,8 +69,8 @@ class DepthRays:
 
 def holds_depth_maps(path: Path) -> bool:
     """Return whether a path is of depth maps: pictures beside clouds and meshes are previews and textures."""
-    found = suffixes_in(path)
-    return bool(found & DEPTH_SUFFIXES) and not found & CLOUD_SUFFIXES
+    suffixes = suffixes_in(path)
+    return bool(suffixes & DEPTH_SUFFIXES) and not suffixes & CLOUD_SUFFIXES
 
 
 class PhotoDepths:
@@ -141,13 +141,13 @@ class PhotoDepths:
             seen = depth > 0
             for along, values in ratios.items():
                 values.append(depth[seen] / rays.depth_m(along)[inside][seen])
-        found = {along: np.concatenate(values) for along, values in ratios.items()}
-        count = len(found["axis"])
+        quotients = {along: np.concatenate(values) for along, values in ratios.items()}
+        count = len(quotients["axis"])
         if count < _LEAST_PIXELS:
             message = f"Only {count} pixels of the depth maps show what stereo shows, too few for a comparison."
             raise InputError("no-overlap", message, field="--lidar")
-        middle = {along: float(np.median(values)) for along, values in found.items()}
-        scatter = {along: mad_sigma(values / middle[along] - 1.0) for along, values in found.items()}
+        middle = {along: float(np.median(values)) for along, values in quotients.items()}
+        scatter = {along: mad_sigma(values / middle[along] - 1.0) for along, values in quotients.items()}
         self._decide(scatter)
         self._check_unit(middle[self.along], count)
         log.info(
@@ -273,7 +273,7 @@ def _matched(path: Path, scene: Scene) -> tuple[dict[int, Path], list[str]]:
         whole = Path(name)
         for key in {whole.as_posix(), whole.with_suffix("").as_posix(), whole.name, whole.stem}:
             by_name.setdefault(key.lower(), []).append(index)
-    found: dict[int, Path] = {}
+    maps: dict[int, Path] = {}
     unmatched = []
     for file in files:
         if file.suffix.lower() not in DEPTH_SUFFIXES or not file.is_file():
@@ -286,12 +286,12 @@ def _matched(path: Path, scene: Scene) -> tuple[dict[int, Path], list[str]]:
             raise InputError("depth-names", message, path=file, field="--lidar")
         if not indices:
             unmatched.append(file.name)
-        elif indices[0] in found:
-            message = f"{found[indices[0]].name} is another depth map of {scene.sparse.image_name[indices[0]]}."
+        elif indices[0] in maps:
+            message = f"{maps[indices[0]].name} is another depth map of {scene.sparse.image_name[indices[0]]}."
             raise InputError("depth-names", message, path=file, field="--lidar")
         else:
-            found[indices[0]] = file
-    return found, unmatched
+            maps[indices[0]] = file
+    return maps, unmatched
 
 
 def _photographs_of(place: str, by_name: dict[str, list[int]]) -> list[int]:

@@ -80,17 +80,17 @@ def registration(cloud: LidarCloud, views: DepthViews, seed: int) -> Registratio
 
 
 def _matches(planes: LidarCloud, views: DepthViews, capture: float) -> PlaneMatches:
-    found: Support = support(planes.position_in_model, views, UP, capture, planes.normal_in_model)
+    seen: Support = support(planes.position_in_model, views, UP, capture, planes.normal_in_model)
     good = np.flatnonzero(
-        (found.views >= _LEAST_VIEWS) & (found.seen_through < found.views) & np.isfinite(found.mean_normal_m)
+        (seen.views >= _LEAST_VIEWS) & (seen.seen_through < seen.views) & np.isfinite(seen.mean_normal_m)
     )
     normal = planes.normal_in_model[good]
-    away = np.einsum("pi,pi->p", normal, found.mean_ray[good]) > 0
+    away = np.einsum("pi,pi->p", normal, seen.mean_ray[good]) > 0
     sign = np.where(away, -1.0, 1.0)
     return PlaneMatches(
         planes.position_in_model[good],
         sign[:, None] * normal,
-        sign * found.mean_normal_m[good],
+        sign * seen.mean_normal_m[good],
         np.abs(normal[:, 2]) < _WALL,
     )
 

@@ -124,14 +124,14 @@ class ModelRenderer:
 
     def key(self) -> str:
         """Return a hash of all that the surface in the training views depends on; errors as of `ImageCache.key`."""
-        model, poses, found = self.model, self.poses, hashlib.sha256(self.backend.name.encode())
-        found.update(repr((model.sh_degree, model.background, model.mip_filter)).encode())
+        model, poses, digest = self.model, self.poses, hashlib.sha256(self.backend.name.encode())
+        digest.update(repr((model.sh_degree, model.background, model.mip_filter)).encode())
         for values in (*self.gaussians.tensors().values(), poses.cam_from_model, poses.cam_center_in_model):
-            found.update(np.ascontiguousarray(values).data)
+            digest.update(np.ascontiguousarray(values).data)
         for index in self.model.indices("train"):
             masked = self.images.mask_key(index) if self.images.is_masked(index) else ""
-            found.update(f"{self.images.key(index)}|{masked}|{self.pinholes.of(index)}".encode())
-        return found.hexdigest()[:32]
+            digest.update(f"{self.images.key(index)}|{masked}|{self.pinholes.of(index)}".encode())
+        return digest.hexdigest()[:32]
 
     def surface(self, index: int) -> tuple[Float32Array, ByteArray]:
         """Return the depth (H, W) of camera `index`, 0 where masked, and the colours (H, W, 3) of its render."""
@@ -248,8 +248,8 @@ class SurfaceViews:
         """
         geo_from_model = self._model.similarity
         up_in_model = geo_from_model.rotation.T @ [0.0, 0.0, 1.0]
-        found = support(point_in_model, self.depth_views(), up_in_model, tolerance, normal_in_model)
-        return found.scaled(geo_from_model.scale)
+        seen = support(point_in_model, self.depth_views(), up_in_model, tolerance, normal_in_model)
+        return seen.scaled(geo_from_model.scale)
 
     def depth_views(self) -> DepthViews:
         """Return the maps with their cameras in `model`, for kernels."""

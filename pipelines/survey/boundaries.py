@@ -71,7 +71,7 @@ def read_outlines(
     for remark in boundary.remarks:
         log.warning("%s", remark.text, extra={"code": remark.code})
     refusal = partial(InputError, path=path, field=crs_field)
-    found = []
+    layers = []
     for layer in boundary.layers:
         text = _crs_text(layer, crs, path, crs_field)
         if not text:
@@ -81,12 +81,12 @@ def read_outlines(
         outlines = Outlines(layer.polygons, own, layer.name)
         if layer.crs_is_default and text == layer.crs:
             _require_degrees(outlines, refusal, crs_field)
-        found.append(outlines)
+        layers.append(outlines)
     if boundary.is_drawing:
-        places = _plan_of(found[0].crs, places_lla)
-        found = _in_unit_of_crs(boundary, found, places, path)
-        return _site(found, places, path) if one_site else tuple(found)
-    return tuple(found)
+        places = _plan_of(layers[0].crs, places_lla)
+        layers = _in_unit_of_crs(boundary, layers, places, path)
+        return _site(layers, places, path) if one_site else tuple(layers)
+    return tuple(layers)
 
 
 def _crs_text(layer: BoundaryLayer, stated: str | None, path: Path, crs_field: str) -> str:
@@ -144,15 +144,15 @@ def _require_degrees(outlines: Outlines, refusal: Refusal, crs_field: str) -> No
 
 
 def _in_unit_of_crs(
-    boundary: Boundary, found: Sequence[Outlines], places: FloatArray | None, path: Path
+    boundary: Boundary, layers: Sequence[Outlines], places: FloatArray | None, path: Path
 ) -> list[Outlines]:
     """Return the outlines of a drawing in the unit of their CRS."""
-    crs = found[0].crs
+    crs = layers[0].crs
     if boundary.unit is None or crs.is_geographic:
-        return list(found)
+        return list(layers)
     name, size_m = boundary.unit
     stated = size_m / crs.horizontal_unit
-    factor = _unit_factor(found, places, stated)
+    factor = _unit_factor(layers, places, stated)
     if factor != 1.0:
         log.warning(
             "%s: coordinates were converted from %s, its $INSUNITS, into %s, the unit of %s.",
@@ -165,7 +165,7 @@ def _in_unit_of_crs(
         )  # fmt: skip
     return [
         replace(one, polygons=tuple(shapely.transform(list(one.polygons), lambda plan: plan * factor)))
-        for one in found
+        for one in layers
     ]
 
 
@@ -178,14 +178,14 @@ def _plan_of(crs: PointCrs, places_lla: FloatArray) -> FloatArray | None:
     return places if len(places) else None
 
 
-def _unit_factor(found: Sequence[Outlines], places: FloatArray | None, factor: float) -> float:
+def _unit_factor(layers: Sequence[Outlines], places: FloatArray | None, factor: float) -> float:
     """Return what coordinates are multiplied by: the stated unit over that of the CRS, or 1 if only that fits."""
     if abs(factor - 1) < _SAME_UNIT:
         return 1.0
     if places is None:
         return factor
 
-    polygons = [one for every in found for one in every.polygons]
+    polygons = [one for every in layers for one in every.polygons]
 
     def meets(scale: float) -> bool:
         return any(bool(shapely.contains_xy(one, *(places / scale).T).any()) for one in polygons)
@@ -193,14 +193,14 @@ def _unit_factor(found: Sequence[Outlines], places: FloatArray | None, factor: f
     return 1.0 if not meets(factor) and meets(1.0) else factor
 
 
-def _site(found: Sequence[Outlines], places: FloatArray | None, path: Path) -> tuple[Outlines, ...]:
+def _site(layers: Sequence[Outlines], places: FloatArray | None, path: Path) -> tuple[Outlines, ...]:
     """Return the layer of a drawing that outlines the site."""
-    choices = [choice for one in found for choice in _choices(one)]
+    choices = [choice for one in layers for choice in _choices(one)]
     if len(choices) < 2 or places is None:
-        return tuple(found)
+        return tuple(layers)
     held = [(one, area) for one, area in choices if shapely.contains_xy(area, *places.T).any()]
     if not held:
-        return tuple(found)
+        return tuple(layers)
     hull = shapely.MultiPoint(places).convex_hull
     agreement = [
         shapely.intersection(area, hull).area / max(shapely.union(area, hull).area, 1e-300) for _, area in held
@@ -208,8 +208,8 @@ def _site(found: Sequence[Outlines], places: FloatArray | None, path: Path) -> t
     order = np.argsort(agreement, kind="stable")[::-1].tolist()
     named = [at for at in order if _SITE.search(held[at][0].layer) and not _FRAME.search(held[at][0].layer)]
     taken, area = held[(named or order)[0]]
-    others = ", ".join(one.layer or "one without a name" for one in found if one.layer != taken.layer)
-    frames = max(len(one.polygons) for one in found if one.layer == taken.layer) - len(taken.polygons)
+    others = ", ".join(one.layer or "one without a name" for one in layers if one.layer != taken.layer)
+    frames = max(len(one.polygons) for one in layers if one.layer == taken.layer) - len(taken.polygons)
     size = "" if taken.crs.is_geographic else f" ({area.area * taken.crs.horizontal_unit**2 / 1e4:.4g} ha)"
     log.warning(
         "%s: layer %s%s was taken as the boundary%s%s.",

@@ -55,16 +55,16 @@ class MeasuredGround(ArrayProduct):
         width_m = wider * max(_FILLED_M, _FILLED_PX * self.size_m[1]) if fill is None else fill
         spike = max(_SPIKE_M / self.cell_m, _SPIKE_CELLS) / 2
         while True:
-            found = _without_islands(
+            cells = _without_islands(
                 _without_spikes(_closed(measured, (width_m / self.cell_m + 1) / 2), spike) & inside
             )
-            filled = (found & ~measured).sum() / max(found.sum(), 1)
+            filled = (cells & ~measured).sum() / max(cells.sum(), 1)
             if fill is not None or filled <= MOST_FILLED or width_m < self.cell_m:
                 break
             width_m /= 2
-        if not found.any():  # narrower than a spike: all that there is
-            found = measured
-        return shapely.make_valid(self._polygon(found).intersection(within))
+        if not cells.any():  # narrower than a spike: all that there is
+            cells = measured
+        return shapely.make_valid(self._polygon(cells).intersection(within))
 
     def share(self, polygon: shapely.Geometry) -> float:
         """Return the measured share of the cells in a polygon."""

@@ -282,8 +282,8 @@ def at_exposures(survey: Survey, lag: FixLag) -> Survey:
         update = {"position_in_geo": vector3(position), "cov_in_geo": _matrix(cov)}
         images.append(image.model_copy(update={"fix": fix.model_copy(update=update)}))
     code = FIX_LAG if lag.applied else FIX_LAG_OPEN
-    told = union(survey.cautions, (Remark(code=code, sentence=lag.sentence),))
-    return survey.model_copy(update={"images": tuple(images), "cautions": told})
+    cautions = union(survey.cautions, (Remark(code=code, sentence=lag.sentence),))
+    return survey.model_copy(update={"images": tuple(images), "cautions": cautions})
 
 
 def _without_common(fix: Fix) -> Fix:

@@ -78,14 +78,14 @@ def verdict(
 
     The photographs show the depth maps, with pixels of `pixel_m` on the surface, and together the surface (S, 3).
     """
-    found = support(cloud.position_in_model, views, UP, _TOLERANCE, cloud.normal_in_model)
+    seen = support(cloud.position_in_model, views, UP, _TOLERANCE, cloud.normal_in_model)
     _, nearest = cKDTree(cloud.position_in_model).query(cloud.position_in_model, k=min(_NEIGHBOURS, len(cloud)))
-    votes = found.views + found.seen_through > 0
-    through = (found.seen_through >= _LEAST_LOOKS) & (found.seen_through > found.views)
+    votes = seen.views + seen.seen_through > 0
+    through = (seen.seen_through >= _LEAST_LOOKS) & (seen.seen_through > seen.views)
     removed = _majority(through, votes, nearest)
-    below = _below_surface(cloud, surface_in_model, pixel_m) & (found.views == 0)
+    below = _below_surface(cloud, surface_in_model, pixel_m) & (seen.views == 0)
     added = _majority(below, np.ones_like(votes), nearest) & ~removed
-    confidence = _confidence(cloud, found, sigma_m, pixel_m)
+    confidence = _confidence(cloud, seen, sigma_m, pixel_m)
     rejected = removed | added
     confidence[rejected] = 0.0
     areas = (*_areas(cloud, removed, "removed"), *_areas(cloud, added, "added"))
@@ -116,15 +116,15 @@ def _below_surface(cloud: LidarCloud, surface: FloatArray, pixel_m: float) -> Bo
     return np.asarray(above[mine[:, 0], mine[:, 1]])
 
 
-def _confidence(cloud: LidarCloud, found: Support, sigma_m: float, pixel_m: float) -> FloatArray:
-    views, through, incidence = found.views, found.seen_through, cloud.incidence()
+def _confidence(cloud: LidarCloud, seen: Support, sigma_m: float, pixel_m: float) -> FloatArray:
+    views, through, incidence = seen.views, seen.seen_through, cloud.incidence()
     stereo2, own2 = (_STEREO_PX * pixel_m) ** 2, sigma_m**2
     stated = stereo2 / (stereo2 + own2)
     flat = np.exp(-0.5 * (cloud.roughness_m**2 / (own2 + (0.1 * cloud.voxel_m) ** 2)) / 4)
     dense = np.minimum(1.0, _SPARSE * cloud.voxel_m / np.maximum(cloud.reach_m, 1e-9))
     beam = np.where(np.isfinite(incidence), 1 - np.exp(-incidence / _GRAZING), 1.0)
     agreement = np.where(views + through > 0, (views + 0.5) / (views + through + 1.0), 0.5)
-    off2 = np.nan_to_num(found.mean_normal_m) ** 2 / (9 * (stereo2 + own2))
+    off2 = np.nan_to_num(seen.mean_normal_m) ** 2 / (9 * (stereo2 + own2))
     return np.asarray(stated * flat * dense * beam * agreement / (1.0 + off2))
 
 

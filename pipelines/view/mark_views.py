@@ -83,7 +83,7 @@ def proposals(
     if template.std() < _LEAST_CONTRAST:
         return
     for number, camera in enumerate(wanted):
-        found = []
+        matches = []
         try:
             image = photograph(camera)
         except GeorefError:  # a photograph that cannot be read has no proposal
@@ -98,9 +98,9 @@ def proposals(
             if min(row, column) == 0 or row == score.shape[0] - 1 or column == score.shape[1] - 1:
                 continue
             off = np.array([column, row]) + _refined(np.asarray(score, np.float64), row, column) - _SEARCH_PX
-            found.append((float(score[row, column]), expected + turn @ off))
-        if found and max(found, key=lambda each: each[0])[0] >= _LEAST_SCORE:
-            best, place = max(found, key=lambda each: each[0])
+            matches.append((float(score[row, column]), expected + turn @ off))
+        if matches and max(matches, key=lambda each: each[0])[0] >= _LEAST_SCORE:
+            best, place = max(matches, key=lambda each: each[0])
             yield Proposal(names[camera], camera, (float(place[0]), float(place[1])), best, names[source])
         advance((number + 1) / len(wanted))
 
@@ -143,11 +143,11 @@ def _patch(image: ByteArray, turn: FloatArray, middle: FloatArray, half: int) ->
 
 def _refined(score: FloatArray, row: int, column: int) -> FloatArray:
     """Return how far (2,) right and down of a pixel the peak of parabolas through its neighbours lies."""
-    found = []
+    shift = []
     for before, after in (
         (score[row, column - 1], score[row, column + 1]),
         (score[row - 1, column], score[row + 1, column]),
     ):
         bend = float(before) - 2 * float(score[row, column]) + float(after)
-        found.append(0.5 * (float(before) - float(after)) / bend if bend < 0 else 0.0)
-    return np.array(found)
+        shift.append(0.5 * (float(before) - float(after)) / bend if bend < 0 else 0.0)
+    return np.array(shift)

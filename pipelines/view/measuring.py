@@ -135,16 +135,16 @@ class MeasuringModel:
         length_m = float(np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1).sum())
         plan, along_m = quantities.along_line(positions[:, :2], max(length_m / fineness.places, pixel_m))
         reach_m = max(float(along_m[1]) / 2, _PROFILE_REACH_PX * pixel_m)
-        found = heights_in_plan(
+        surface = heights_in_plan(
             self.reader.renderer, plan, float(np.median(positions[:, 2])), reach_m,
             most_views=fineness.views, advance=fineness.advance,
         )  # fmt: skip
-        in_geo = np.column_stack([plan, np.where(found.known, found.height_m, np.median(positions[:, 2]))])
+        in_geo = np.column_stack([plan, np.where(surface.known, surface.height_m, np.median(positions[:, 2]))])
         xyz = self.target.xyz_from_geo(in_geo)
         sigma_m = np.full(len(plan), np.nan)
         if self.posterior is not None and self.posterior.grid is not None:
-            sigma_m = np.hypot(np.sqrt(self.posterior.grid.cov_at(in_geo)[:, 2, 2]), found.sigma_m)
-        return quantities.Profile(along_m, np.where(found.known, xyz[:, 2], np.nan), sigma_m, xyz[:, :2])
+            sigma_m = np.hypot(np.sqrt(self.posterior.grid.cov_at(in_geo)[:, 2, 2]), surface.sigma_m)
+        return quantities.Profile(along_m, np.where(surface.known, xyz[:, 2], np.nan), sigma_m, xyz[:, :2])
 
     def rasters(self) -> list[str]:
         """Return the rasters of heights in the workspace that may be the base of a volume."""

@@ -60,8 +60,8 @@ def described_scene(workspace: Workspace, model: MeasuringModel, frame: ViewFram
         "cameras": [_camera(model, frame, camera) for camera in range(len(model.solution.cameras))],
         "surveyed": [
             {"name": point.name, "kind": kind, "at": frame.from_geo(np.array(point.position_in_geo)).tolist()}
-            for kind, found in surveyed
-            for point in found
+            for kind, points in surveyed
+            for point in points
         ],
         "errors": error_arrows(workspace, survey, frame),
         "tie_points": _tie_points(model, frame),

@@ -64,17 +64,17 @@ def propose_marks(workspace: Workspace, options: ProposalOptions, progress: Prog
     solution, survey = read_solution(workspace), load_survey(workspace)
     sparse = solution.with_lenses(read_sfm(workspace, solution))
     photograph = Photographs(workspace, survey, sparse).full
-    found, left_out = proposed_marks(survey, solution, sparse, photograph, options.reach, progress=progress)
+    proposed, left_out = proposed_marks(survey, solution, sparse, photograph, options.reach, progress=progress)
     rows = []
-    for each in found:
+    for each in proposed:
         numbers = (each.mark.x_px, each.mark.y_px, each.mark.sigma_px)
         cells = (f"{value:.3f}" for value in numbers)
         rows.append((each.mark.image, each.point, *cells, each.how, f"{each.score:.3f}"))
     file = workspace.root / FILE
     file.parent.mkdir(exist_ok=True)
     replace_texts({file: table_text([("image", "label", "x", "y", "sigma", "how", "score"), *rows])})
-    quarters = sum(each.how == "quarters" for each in found)
-    return ProposalSummary(file, len(found), len({each.point for each in found}), quarters, left_out)
+    quarters = sum(each.how == "quarters" for each in proposed)
+    return ProposalSummary(file, len(proposed), len({each.point for each in proposed}), quarters, left_out)
 
 
 def proposed_marks(
@@ -103,7 +103,7 @@ def proposed_marks(
         own = {mark.image: (mark.x_px, mark.y_px) for mark in point.marks}
         by_marks = triangulated_points(solution, rays_of(MarkedPoint(point.name, None, marks=own), sparse))[0]
         places[point.name] = by_marks if np.isfinite(by_marks).all() else np.array(point.position_in_geo)
-    found: list[ProposedMark] = []
+    proposed: list[ProposedMark] = []
     wanted: dict[int, list[tuple[str, FloatArray]]] = defaultdict(list)
     for point in points:
         marked = {mark.image for mark in point.marks}
@@ -112,12 +112,12 @@ def proposed_marks(
                 wanted[camera].append((point.name, pixel))
     with progress.task("quartered targets", len(wanted)) as task:
         for camera, mine in wanted.items():
-            found += _quarters(sparse.image_name[camera], mine, photograph, camera, reach_px)
+            proposed += _quarters(sparse.image_name[camera], mine, photograph, camera, reach_px)
             task.advance()
-    found, left_out = _met(points, found, sparse)
+    proposed, left_out = _met(points, proposed, sparse)
     with progress.task("likeness", len(points)) as task:
         for point in points:
-            of_point = [*point.marks, *(each.mark for each in found if each.point == point.name)]
+            of_point = [*point.marks, *(each.mark for each in proposed if each.point == point.name)]
             marks = {mark.image: (mark.x_px, mark.y_px) for mark in of_point}
             marked_point = MarkedPoint(point.name, None, marks=marks)
             alike = proposals(
@@ -126,10 +126,10 @@ def proposed_marks(
             for each in alike if marks else ():
                 x_px, y_px = each.place_px
                 mark = Mark(image=each.image, x_px=x_px, y_px=y_px, sigma_px=_CORRELATED_SIGMA_PX)
-                found.append(ProposedMark(point.name, mark, "correlation", each.score))
+                proposed.append(ProposedMark(point.name, mark, "correlation", each.score))
             task.advance()
-    found, more = _met(points, found, sparse)
-    return sorted(found, key=lambda each: (each.point, each.mark.image)), (*left_out, *more)
+    proposed, more = _met(points, proposed, sparse)
+    return sorted(proposed, key=lambda each: (each.point, each.mark.image)), (*left_out, *more)
 
 
 def _quarters(
@@ -143,22 +143,22 @@ def _quarters(
         grey = np.asarray(cv2.cvtColor(photograph(camera), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
     except GeorefError:  # a photograph that cannot be read has no proposal
         return []
-    found = []
+    proposed = []
     for name, pixel in wanted:
         target = find_quarters(grey, pixel, reach_px)
         if target is not None:
             x_px, y_px = target.center_px.tolist()
             mark = Mark(image=image, x_px=x_px, y_px=y_px, sigma_px=target.sigma_px)
-            found.append(ProposedMark(name, mark, "quarters", target.share))
-    return found
+            proposed.append(ProposedMark(name, mark, "quarters", target.share))
+    return proposed
 
 
 def _met(
-    points: Sequence[SurveyedPoint], found: Sequence[ProposedMark], sparse: SparseModel
+    points: Sequence[SurveyedPoint], proposed: Sequence[ProposedMark], sparse: SparseModel
 ) -> tuple[list[ProposedMark], tuple[str, ...]]:
     """Return the proposals but those that the other marks of their points do not meet, and these."""
     by_point: dict[str, list[Mark]] = defaultdict(list)
-    for each in found:
+    for each in proposed:
         by_point[each.point].append(each.mark)
     # A mark's σ tells nothing of the cameras: none counts as better than one set by a person.
     all_marks = [
@@ -172,10 +172,10 @@ def _met(
         for point in points
     ]
     wrong = {(mark.point, mark.image): mark.off_px for mark in wrong_marks(all_marks, sparse)}
-    kept = [each for each in found if (each.point, each.mark.image) not in wrong]
+    kept = [each for each in proposed if (each.point, each.mark.image) not in wrong]
     left_out = [
         f"{each.point} in {each.mark.image} ({wrong[each.point, each.mark.image]:.0f} px)"
-        for each in found
+        for each in proposed
         if (each.point, each.mark.image) in wrong
     ]
     return kept, tuple(left_out)

@@ -33,14 +33,14 @@ def distances(points: PickedPoints) -> tuple[Quantity, ...]:
     line = points.position_in_geo[1] - points.position_in_geo[0]
     rise = float(points.height_m[1] - points.height_m[0])
     plan, up = np.array([*line[:2], 0.0]), np.array([0.0, 0.0, 1.0])
-    found = (
+    lengths = (
         ("distance", float(np.linalg.norm(line)), _unit(line)),
         ("horizontal distance", float(np.linalg.norm(plan)), _unit(plan)),
         ("height difference", rise, up),
     )
     return tuple(
         Quantity(name, value, propagated(np.stack([-along, along]), points.cov_in_geo), "m")
-        for name, value, along in found
+        for name, value, along in lengths
     )
 
 

@@ -78,19 +78,19 @@ class SavedMeasurements:
     def put(self, measurement: NamedMeasurement, row: int | None = None) -> None:
         """Save a measurement, in the place of its id, else in a row, else last; a GeorefError: it was not."""
 
-        def with_it(found: list[NamedMeasurement]) -> list[NamedMeasurement]:
-            ids = [each.id for each in found]
+        def with_it(saved: list[NamedMeasurement]) -> list[NamedMeasurement]:
+            ids = [each.id for each in saved]
             if measurement.id in ids:
-                found[ids.index(measurement.id)] = measurement
+                saved[ids.index(measurement.id)] = measurement
             else:
-                found.insert(len(found) if row is None else row, measurement)
-            return found
+                saved.insert(len(saved) if row is None else row, measurement)
+            return saved
 
         self._change(with_it)
 
     def remove(self, measurement: NamedMeasurement) -> None:
         """Remove a measurement; a GeorefError: nothing was removed, and why."""
-        self._change(lambda found: [each for each in found if each.id != measurement.id])
+        self._change(lambda saved: [each for each in saved if each.id != measurement.id])
 
     def _change(self, changed: Callable[[list[NamedMeasurement]], list[NamedMeasurement]]) -> None:
         with changing(self._folder):
@@ -141,9 +141,9 @@ def tables_of(measurements: Sequence[NamedMeasurement]) -> dict[str, str]:
         lines: list[Sequence[object]] = [["name", "wkt", "crs", *_PLACE, *heads]]
         for each in rows:
             place = _place_cells(each.points[0]) if kind == "point" else ("",) * len(_PLACE)
-            found = {quantity.name: quantity for quantity in each.quantities}
+            by_name = {quantity.name: quantity for quantity in each.quantities}
             values: list[object] = []
-            for one in map(found.get, names):
+            for one in map(by_name.get, names):
                 values += (
                     ["", "", ""] if one is None else [one.value, "" if one.sigma is None else one.sigma, one.unit]
                 )

@@ -119,7 +119,7 @@ class Viewer:
 
     def seen_by(self, request: requests.SeenRequest) -> list[Json]:
         """Return the photographs that see a place, the best first: fine pixels, and away from their rim."""
-        place, found = request.position(), []
+        place, photographs = request.position(), []
         centers = self.solution.center_in_geo
         for camera, pixel in appears_in(place, self.solution, self.sparse):
             lens, away = self.sparse.camera_of(camera), centers[camera] - place
@@ -128,8 +128,8 @@ class Viewer:
             rim = float(np.min(np.minimum(pixel, size - pixel) / size))
             down_deg = float(np.degrees(np.arccos(np.clip(away[2] / away_m, -1, 1))))
             own = {"camera": camera, "image": self.name_of(camera), "px": pixel.tolist(), "gsd_m": gsd_m}
-            found.append((gsd_m * (2.0 if rim < _PIXEL_MARGIN else 1.0), {**own, "angle_deg": down_deg}))
-        return [each for _, each in sorted(found, key=lambda each: each[0])[:_MOST_SEEN]]
+            photographs.append((gsd_m * (2.0 if rim < _PIXEL_MARGIN else 1.0), {**own, "angle_deg": down_deg}))
+        return [each for _, each in sorted(photographs, key=lambda each: each[0])[:_MOST_SEEN]]
 
     def name_of(self, camera: int) -> str:
         return self.sparse.image_name[camera]
@@ -144,11 +144,11 @@ class Viewer:
 
     def pick(self, request: requests.PickRequest) -> Json:
         """Return the surface under a pixel of a page, with the σ of pointing at it, or why there is none."""
-        found = self.model.reader.under(self.frame.sight(request.camera(), request.x, request.y))
-        if isinstance(found, SurfacePoint):
+        point = self.model.reader.under(self.frame.sight(request.camera(), request.x, request.y))
+        if isinstance(point, SurfacePoint):
             cov = pointing_covariance(self.model.reader, self.frame, request.camera(), (request.x, request.y))
-            found = replace(found, cov_of_surface=found.cov_of_surface + cov)
-        return self._measured(found)
+            point = replace(point, cov_of_surface=point.cov_of_surface + cov)
+        return self._measured(point)
 
     def surveyed(self, name: str) -> Json:
         """Return a surveyed point as its marks show it on the rendered surface, with its surveyed place."""
@@ -158,8 +158,11 @@ class Viewer:
                 "no-such-point", f"There is no surveyed point {name!r}.", remedy="Load the page again."
             )
         rays = mark_rays((point,), self.sparse)
-        found = self._measured(self.model.reader.behind_marks(rays))
-        return {**found, "surveyed": self.model.target.xyz_from_geo(np.array([point.position_in_geo]))[0].tolist()}
+        measured = self._measured(self.model.reader.behind_marks(rays))
+        return {
+            **measured,
+            "surveyed": self.model.target.xyz_from_geo(np.array([point.position_in_geo]))[0].tolist(),
+        }
 
     def marked(self, name: str) -> Json:
         """Return a marked point, triangulated."""
@@ -284,12 +287,12 @@ class Viewer:
         return path.read_bytes()
 
     def _saved(self, identity: str) -> NamedMeasurement:
-        found = next((each for each in self.saved.all if each.id == identity), None)
-        if found is None:
+        measurement = next((each for each in self.saved.all if each.id == identity), None)
+        if measurement is None:
             raise InputError(
                 "no-such-measurement", "The measurement was removed meanwhile.", remedy="Load the page again."
             )
-        return found
+        return measurement
 
     # Marking
 
@@ -431,13 +434,13 @@ class Viewer:
                 raise InputError(
                     "no-marks", f"{point.name} needs a mark, and its coordinates or a second mark, first."
                 )
-            found: list[Json] = []
-            yield found
+            answers: list[Json] = []
+            yield answers
             for each in proposals(
                 self.solution, self.sparse, point, place, self.photographs.full, advance=job.advance
             ):
-                found = [*found, asdict(each)]
-                yield found
+                answers = [*answers, asdict(each)]
+                yield answers
 
         return self.jobs.begin(request, work)
 

@@ -164,10 +164,10 @@ def labelled(pictures: Sequence[ByteArray], labels: Sequence[str]) -> ByteArray:
         (strip.shape[1] / _DOTS_PER_INCH, band_px / _DOTS_PER_INCH), None, dots_per_inch=_DOTS_PER_INCH
     )
     most = max(int(width / (_LETTER_WIDTH * letters_px)), 1)
-    for place, text in enumerate(labels):
+    for index, text in enumerate(labels):
         shown = text if len(text) <= most else f"…{text[len(text) - most + 1 :]}"
         figure.text(
-            (place + 0.5) / len(labels),
+            (index + 0.5) / len(labels),
             0.5,
             shown,
             ha="center",
@@ -184,7 +184,7 @@ def without_labels(strip: ByteArray, count: int) -> list[ByteArray]:
     """Return the pictures (H, W, 3) of a strip that `labelled` has made of `count` pictures."""
     width = strip.shape[1] // count
     pictures = strip[band_height_px(width) :]
-    return [pictures[:, place * width : (place + 1) * width] for place in range(count)]
+    return [pictures[:, index * width : (index + 1) * width] for index in range(count)]
 
 
 def band_height_px(width_px: int) -> int:

@@ -52,17 +52,17 @@ def write_axes(axes: Axes, coordinates: MapCoordinates | None, most: tuple[int, 
 
     (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
     if coordinates is None:
-        coordinates = MapCoordinates("local frame", ("x", "y"), "m", lambda place: place)
+        coordinates = MapCoordinates("local frame", ("x", "y"), "m", lambda positions: positions)
     corner = coordinates.of(np.array([[west, south], [east, south], [west, north]]))
     edges = ((corner[:2, 0], (west, east)), (corner[[0, 2], 1], (south, north)))
     for index, (axis, (ends, side)) in enumerate(zip((axes.xaxis, axes.yaxis), edges, strict=True)):
         low, high = sorted(ends.tolist())
         ticks = MaxNLocator(nbins=most[index], steps=[1, 2, 5, 10]).tick_values(low, high)
         ticks = ticks[(ticks >= low) & (ticks <= high)]
-        place = np.interp(ticks, [low, high], side if ends[0] <= ends[1] else side[::-1])
+        positions = np.interp(ticks, [low, high], side if ends[0] <= ends[1] else side[::-1])
         step = float(np.diff(ticks).min()) if len(ticks) > 1 else high - low or 1.0
         decimals = max(0, ceil(-log10(step) - 1e-9))
-        axis.set_ticks(place, labels=[f"{value:.{decimals}f}" for value in ticks])
+        axis.set_ticks(positions, labels=[f"{value:.{decimals}f}" for value in ticks])
         text = f"{coordinates.names[index]} in {coordinates.unit} ({coordinates.crs})"
         axis.set_label_text(text, fontsize=look.LABEL_POINTS)
 
@@ -122,8 +122,8 @@ def new_plan(
 
 def bar_axes(figure: Figure, axes: Axes) -> Axes:
     """Return the axes of a colour bar beside a plan that has room for it."""
-    place, width = axes.get_position(), figure.get_figwidth()
-    return figure.add_axes((place.x1 + 0.1 / width, place.y0, 0.16 / width, place.height))
+    box, width = axes.get_position(), figure.get_figwidth()
+    return figure.add_axes((box.x1 + 0.1 / width, box.y0, 0.16 / width, box.height))
 
 
 def add_bearings(axes: Axes) -> None:

@@ -74,8 +74,8 @@ class CpuRasterizer:
         parameters = [_array(tensor) for tensor in gaussians.tensors().values()]
         with KERNEL_LOCK, _threads_for(settings.image_of(camera)):
             view = cpu_gaussian.make_view(camera, settings, pose)
-            found, _ = _find_visible(parameters, pose, view, numba.get_num_threads(), roughly=True)
-        return torch.from_numpy(found)
+            visible, _ = _find_visible(parameters, pose, view, numba.get_num_threads(), roughly=True)
+        return torch.from_numpy(visible)
 
 
 # Tiles (16 × 32 px) that a visible Gaussian touches on average: 3 to 6 in trained models.

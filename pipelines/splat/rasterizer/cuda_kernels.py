@@ -117,8 +117,8 @@ def kernels_ready() -> str | None:
 
 def _prebuilt() -> bool:
     """Return whether the installed gsplat is a build with kernels, for this torch and CUDA."""
-    found = importlib.util.find_spec("gsplat")
-    places = (found.submodule_search_locations or ()) if found is not None else ()
+    spec = importlib.util.find_spec("gsplat")
+    places = (spec.submodule_search_locations or ()) if spec is not None else ()
     return any(path.suffix in (".so", ".pyd") for place in places for path in Path(place).glob("csrc.*"))
 
 
@@ -141,24 +141,24 @@ def _version(distribution: str) -> str:
 def _capabilities() -> list[str]:
     """Return the compute capabilities of the GPUs of this machine (`8.9`)."""
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    found = {torch.cuda.get_device_capability(index) for index in range(count)}
-    return [f"{major}.{minor}" for major, minor in sorted(found)]
+    capabilities = {torch.cuda.get_device_capability(index) for index in range(count)}
+    return [f"{major}.{minor}" for major, minor in sorted(capabilities)]
 
 
 def _architectures() -> list[str]:
     named = os.environ.get("TORCH_CUDA_ARCH_LIST", "").replace(";", " ").split()
-    found = sorted(name.removesuffix("+PTX") for name in named) or _capabilities()
-    if not found:
+    architectures = sorted(name.removesuffix("+PTX") for name in named) or _capabilities()
+    if not architectures:
         message = "This machine has no GPU to compile for."
         remedy = (
             "Name its compute capability in the variable TORCH_CUDA_ARCH_LIST (8.6 for the RTX 30 series, 8.9 for "
             "40, 12.0 for 50, 8.0 for A100, 9.0 for H100; several with blanks)."
         )
         raise InputError("gpu-unknown", message, remedy=remedy)
-    if not all(name.replace(".", "").removesuffix("a").isdecimal() for name in found):
+    if not all(name.replace(".", "").removesuffix("a").isdecimal() for name in architectures):
         message = f"TORCH_CUDA_ARCH_LIST is {' '.join(named)!r}; numbers like 8.6 with blanks between are expected."
         raise InputError("compute-capability", message)
-    return found
+    return architectures
 
 
 @contextmanager
@@ -233,8 +233,8 @@ def _link_library(home: Path, draft: Path) -> Path:
 
 def _sources() -> int:
     patterns = ("cuda/csrc/*.cu", "cuda/csrc/*.cpp", "cuda/*.cpp")
-    found = importlib.util.find_spec("gsplat")
-    places = (found.submodule_search_locations or ()) if found is not None else ()
+    spec = importlib.util.find_spec("gsplat")
+    places = (spec.submodule_search_locations or ()) if spec is not None else ()
     return sum(len(list(Path(place).glob(pattern))) for place in places for pattern in patterns)
 
 

@@ -108,11 +108,11 @@ class Parts:
             manifest = variant.manifest(spec)
             if manifest is None:
                 return "not trained"
-            asked = request(variant, spec, self.flags(spec, number), {})
+            requested = request(variant, spec, self.flags(spec, number), {})
         except (MissingProductError, InputError) as error:
             return str(error)
         return why_damaged(variant.damaged(spec, manifest, {}, by_content=False)) or why_stale(
-            variant, asked, manifest
+            variant, requested, manifest
         )
 
     def is_outdated(self) -> bool:

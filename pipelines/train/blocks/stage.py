@@ -143,12 +143,12 @@ def compare_neighbours(parts: Parts, plan: BlockPlan, solution: Solution, progre
     if not pairs:
         return ()
     views = SeamViews(parts, plan, solution)
-    found = []
+    seams = []
     with progress.task("seams", len(pairs)) as task:
         for first, second in pairs:
-            found.append(views.seam(first, second))
+            seams.append(views.seam(first, second))
             task.advance()
-    return tuple(seam for seam in found if seam is not None)
+    return tuple(seam for seam in seams if seam is not None)
 
 
 @dataclass(frozen=True)
