@@ -164,16 +164,16 @@ def _weighted(
         information = information + np.einsum("nap,na,naq->pq", design, whitened, design)
         right = right + np.einsum("nap,na,na->p", design, whitened, missed)
         step = np.linalg.solve(information, right)
-        left = missed - design @ step
-        robust = np.median(np.abs(left), axis=0) / _MEDIAN_NORMAL * np.sqrt(count / max(count - 2.0, 1.0))
+        residual = missed - design @ step
+        robust = np.median(np.abs(residual), axis=0) / _MEDIAN_NORMAL * np.sqrt(count / max(count - 2.0, 1.0))
         scatter = np.maximum(robust, _LEAST_SCATTER)
-        weight = cauchy_weight(left**2 / scatter**2, 1)
+        weight = cauchy_weight(residual**2 / scatter**2, 1)
         # A line counts once: its photographs share wind, speed and the way in which they were triggered.
         information[:2, :2] *= lines / count
         information[:2, 2:] *= lines / count
         information[2:, :2] *= lines / count
-        own = (information[2:, 2:] - np.diag(prior)) * lines / count + np.diag(prior)
-        within = information[:2, :2] - information[:2, 2:] @ np.linalg.solve(own, information[2:, :2])
+        lines_information = (information[2:, 2:] - np.diag(prior)) * lines / count + np.diag(prior)
+        within = information[:2, :2] - information[:2, 2:] @ np.linalg.solve(lines_information, information[2:, :2])
         value, vector = np.linalg.eigh(within)
         covariance = (vector / np.maximum(value, _WORST**-2 / 100.0)) @ vector.T
     moved = up + axes.T @ step[:2]

@@ -306,9 +306,9 @@ def _drift_of(survey: Survey, names: tuple[str, ...]) -> FloatArray:
         if not any(of_session.drift_m):
             continue
         rows = np.flatnonzero(session == number)
-        own = drift_shapes(time_s[rows], of_session.drift_time_s)
-        shapes = np.pad(shapes, ((0, 0), (0, max(0, own.shape[1] - shapes.shape[1]))))
-        shapes[rows, : own.shape[1]] = own
+        session_shapes = drift_shapes(time_s[rows], of_session.drift_time_s)
+        shapes = np.pad(shapes, ((0, 0), (0, max(0, session_shapes.shape[1] - shapes.shape[1]))))
+        shapes[rows, : session_shapes.shape[1]] = session_shapes
     return shapes
 
 
@@ -363,12 +363,12 @@ def earlier_of(scene: Scene, survey: Survey) -> EarlierPoints | None:
         return None
     index = row_of[np.searchsorted(sparse.point_id, np.array(rays.point_name, dtype=np.int64))]
     position = common.position_in_geo(survey.origin_on_earth)[index]
-    own = _mark_covariance(scene, rays, position) * float(common.factor)
+    cov_of_marks = _mark_covariance(scene, rays, position) * float(common.factor)
     return EarlierPoints(
         name=rays.point_name,
         **_of_rays(scene, rays),
         position_in_geo=position,
-        cov=common.cov_in_geo(survey.origin_on_earth)[index] + own,
+        cov=common.cov_in_geo(survey.origin_on_earth)[index] + cov_of_marks,
     )
 
 

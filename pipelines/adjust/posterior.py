@@ -69,8 +69,8 @@ class Posterior:
         that its marks do not determine.
         """
         rays = rows_of(rays, np.flatnonzero(np.isfinite(point_in_geo[rays.point]).all(axis=1)))
-        own = self._intersected(np.nan_to_num(point_in_geo), rays.point, rays.camera, rays.sigma_px)
-        return own + self.datum_against_points + self._of_earlier_each(point_in_geo)
+        intersected = self._intersected(np.nan_to_num(point_in_geo), rays.point, rays.camera, rays.sigma_px)
+        return intersected + self.datum_against_points + self._of_earlier_each(point_in_geo)
 
     def jointly_of_marked_points(self, point_in_geo: FloatArray, rays: MarkRays) -> FloatArray:
         """Return the joint covariance (3 J, 3 J) in m² of points (J, 3) that are all determined by their marks.
@@ -121,8 +121,8 @@ class Posterior:
         NaN for a point that fewer than two rays see; arguments as of `of_scene`.
         """
         sigma_px = np.full(len(point), np.nan if self.solution.sigma_px is None else self.solution.sigma_px)
-        own = self._intersected(point_in_geo, point, camera, sigma_px) + self.datum
-        return own + self._of_earlier_each(point_in_geo)
+        intersected = self._intersected(point_in_geo, point, camera, sigma_px) + self.datum
+        return intersected + self._of_earlier_each(point_in_geo)
 
     def derivatives(
         self, point_in_geo: FloatArray, point: IntArray, camera: IntArray, *, of_tracks: bool = False

@@ -165,7 +165,7 @@ class _Tie:
     def _of_part(self, point_in_geo: FloatArray, point: IntArray, camera: IntArray) -> FloatArray:
         normal = self.later.posterior.normal
         by_poses, by_border, _ = self.later.posterior.derivatives(point_in_geo, point, camera)
-        own = normal.covariances(by_poses, by_border, 3)
+        of_later = normal.covariances(by_poses, by_border, 3)
         poses, border = normal.solve(by_poses.T.toarray(), by_border.T)
         response = (self.common.by_poses @ poses + self.common.by_border @ border).T  # J₂ N₂⁻¹ Aᵀ W
         there = self._at_earlier(point_in_geo)
@@ -174,7 +174,7 @@ class _Tie:
         of_earlier = self.earlier.posterior.normal.covariances(
             csr_matrix(follows[:, :count]), np.asarray(follows[:, count:]), 3
         )
-        return own + of_earlier
+        return of_later + of_earlier
 
     def _at_earlier(self, point_in_geo: FloatArray) -> FloatArray:
         """Return the derivative (3 C, 6 n' + b') of the earlier places, along the later axes."""

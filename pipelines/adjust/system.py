@@ -88,8 +88,8 @@ class Problem:
     def poses(self) -> bsr_matrix:
         """Information (6 n, 6 n) of the image observations on x, with a prior of cameras that nothing observes."""
         bundle = self.bundle
-        own = bundle.sums.poses.diagonal() * bundle.unit**2
-        weak = own < bundle.loosest_sigma_m**-2
+        variance = bundle.sums.poses.diagonal() * bundle.unit**2
+        weak = variance < bundle.loosest_sigma_m**-2
         prior = diags(weak * (_UNSEEN * bundle.unit * bundle.loosest_sigma_m) ** -2.0).tobsr((6, 6))
         return (self._images + prior).tobsr((6, 6))
 

@@ -122,8 +122,8 @@ def change_along_normals(
 def _sorted(path: Path, grid: CommonGrid, folder: Path, progress: Progress) -> TiledPoints:
     """Sort a cloud into squares, in metres, with the variance of each point along its normal."""
     file = open_las(path)
-    own, rasters = load_json(CrsSidecar, sidecar_path(path)), grid.rasters[1].sidecar
-    if (own.crs_wkt, own.vertical_datum) != (rasters.crs_wkt, rasters.vertical_datum):
+    sidecar, rasters = load_json(CrsSidecar, sidecar_path(path)), grid.rasters[1].sidecar
+    if (sidecar.crs_wkt, sidecar.vertical_datum) != (rasters.crs_wkt, rasters.vertical_datum):
         raise InputError(
             "epochs-differ-in-crs",
             "is in another CRS than the rasters.",
@@ -152,11 +152,11 @@ def _squares(
     margin_m = reach_m + 3 * core_m
     with progress.task("squares", len(earlier.count)) as task:
         for square in sorted(earlier.count):
-            rows, own = earlier.around(square, margin_m)
+            rows, inside = earlier.around(square, margin_m)
             others, _ = later.around(square, margin_m + float(np.linalg.norm(datum.shift_m)))
             place, moved = rows["position"], others["position"] - datum.shift_m
             normal = oriented_normals(place, core_m / 2, place, rows["normal"].astype(np.float64))
-            usable = np.flatnonzero(own & np.isfinite(normal[:, 0]))
+            usable = np.flatnonzero(inside & np.isfinite(normal[:, 0]))
             core = usable[first_of_voxels(place[usable], core_m)]
             distance_m, noise_m = m3c2(
                 at_random(place), at_random(moved), place[core], normal[core], radius_m=core_m, reach_m=reach_m

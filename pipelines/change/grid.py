@@ -166,11 +166,11 @@ class CommonGrid:
         left, top = max(window.column - reach, 0), max(window.row - reach, 0)
         columns = min(window.column + window.columns + reach, self.frame.columns) - left
         rows = min(window.row + window.rows + reach, self.frame.rows) - top
-        own = (
+        core = (
             slice(window.row - top, window.row - top + window.rows),
             slice(window.column - left, window.column - left + window.columns),
         )
-        return GridWindow(left, top, columns, rows), own
+        return GridWindow(left, top, columns, rows), core
 
     def part(self, window: GridWindow) -> RasterFrame:
         return self.frame.part(window.column, window.row, window.columns, window.rows)
@@ -192,10 +192,10 @@ class CommonGrid:
 
     def cells(self, window: GridWindow) -> Cells:
         """Return the cells of a window, before any registration."""
-        wide, own = self.around(window, _MARGIN)
+        wide, core = self.around(window, _MARGIN)
         heights = self.heights_m(wide)
         reach = int(np.clip(np.ceil(2 * self.datum_h_m / self.cell_m), 1, _MOST_REACH))
-        variance, step = np.zeros(heights[0][own].shape), np.zeros(heights[0][own].shape)
+        variance, step = np.zeros(heights[0][core].shape), np.zeros(heights[0][core].shape)
         slopes, both = [], np.ones(step.shape, dtype=bool)
         for one, node, height in zip(self.rasters, self._node_variance, heights, strict=True):
             sigma = self._read(one, one.names[1], self.part(wide))
@@ -203,18 +203,18 @@ class CommonGrid:
             measured = self._measured(one, self.part(wide))
             beside = step_variance(height, np.where(measured, np.sqrt(noise), 0.0), self.cell_m, reach)
             # The σ of an interpolated cell is that of its interpolation.
-            step = np.maximum(step, np.where(measured, beside, noise)[own])
-            variance += np.where(measured, noise, 0.0)[own]
-            both &= measured[own]
+            step = np.maximum(step, np.where(measured, beside, noise)[core])
+            variance += np.where(measured, noise, 0.0)[core]
+            both &= measured[core]
             # On the rim of what is known, the slope is not: such a cell counts as steep.
-            slope = self._slope(height)[own]
+            slope = self._slope(height)[core]
             slopes.append(np.where(np.isfinite(slope), slope, 2 * STEEPEST))
         # Either surface may be steep here. What is steeper yet is a step.
         square = np.minimum(np.maximum(*(np.sum(slope**2, axis=-1) for slope in slopes)), STEEPEST**2)
         for one in self.rasters:  # A height lies somewhere in its cell.
             variance += square * one.frame.step_x * one.frame.step_y * self.unit_m**2 / 12
         variance += square * self._between(self._node_h, window) + (0.1 * self.cell_m) ** 2
-        difference = (heights[1] - heights[0])[own]
+        difference = (heights[1] - heights[0])[core]
         datum = np.where(np.isfinite(difference), self._between(self._node_datum, window), np.nan)
         return Cells(difference, variance, datum, slopes[0], step, both)
 

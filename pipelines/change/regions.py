@@ -141,13 +141,13 @@ def find_regions(
             [one + two for one, two in zip(sums, more, strict=True)]
             for sums, more in zip((whole, cores), of_window, strict=True)
         )
-        for place, polygon in enumerate(given):
+        for rank, polygon in enumerate(given):
             of_polygon = cells_inside(polygon, grid.part(window)).astype(np.int64)
-            of_given[place] += region_volumes(of_polygon, cells, 1)[0]
-    for place, polygon in enumerate(given):
+            of_given[rank] += region_volumes(of_polygon, cells, 1)[0]
+    for rank, polygon in enumerate(given):
         cells_in_all = round(polygon.area / (grid.frame.step_x * grid.frame.step_y))
-        missing = max(cells_in_all - of_given[place].cells, 0)
-        of_given[place] = replace(of_given[place], missing=missing)
+        missing = max(cells_in_all - of_given[rank].cells, 0)
+        of_given[rank] = replace(of_given[rank], missing=missing)
     polygons = list(given)
     net, sigma, net_of_core, sigma_of_core = (
         np.array(values)
@@ -188,7 +188,7 @@ def without_doubtful(
     moved = np.zeros(len(found.regions) + 1, dtype=np.int32)
     moved[np.array(kept, dtype=np.int64) + 1] = 1 + np.arange(len(kept))
     number, inside = moved[found.number], np.isin(found.number, np.array(out, dtype=np.int64) + 1)
-    left = _named(
+    remaining = _named(
         tuple(found.volumes[index] for index in kept),
         [found.polygons[index] for index in kept],
         given=sum(found.regions[index].name.startswith("P") for index in kept),
@@ -201,7 +201,7 @@ def without_doubtful(
         DoubtfulRegion(**found.regions[index].model_dump() | {"name": f"D{rank}"}, reason=reason)
         for rank, index in enumerate(out, start=1)
     )
-    return left, DoubtfulRegions(regions, [found.polygons[index] for index in out], inside)
+    return remaining, DoubtfulRegions(regions, [found.polygons[index] for index in out], inside)
 
 
 def _named(

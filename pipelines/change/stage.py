@@ -281,23 +281,23 @@ def _write_rasters(
     windows, levels = list(grid.windows()), []
     with stage.progress.task("windows", len(windows)) as task:
         for window in windows:
-            wide, own = grid.around(window, reach)
+            wide, core = grid.around(window, reach)
             cells = grid.registered(wide, noise, applied=registered)
             lod = level_of_detection(cells, noise.factor)
-            sign[window.slices] = significant_change(cells, noise.factor, reach)[own]
-            known = np.isfinite(cells.difference_m[own])
+            sign[window.slices] = significant_change(cells, noise.factor, reach)[core]
+            known = np.isfinite(cells.difference_m[core])
             bands = {
-                "difference": cells.difference_m[own],
-                "sigma": np.where(known, lod[own] / QUANTILE_95, np.nan),
-                "lod": np.where(known, lod[own], np.nan),
-                "datum": np.where(known, cells.datum_m[own], np.nan),
-                "variance": np.where(known, cells.variance_m2[own], np.nan),
-                "step": cells.step_m2[own],
-                "measured": (known & cells.is_measured[own]).astype(np.uint8),
+                "difference": cells.difference_m[core],
+                "sigma": np.where(known, lod[core] / QUANTILE_95, np.nan),
+                "lod": np.where(known, lod[core], np.nan),
+                "datum": np.where(known, cells.datum_m[core], np.nan),
+                "variance": np.where(known, cells.variance_m2[core], np.nan),
+                "step": cells.step_m2[core],
+                "measured": (known & cells.is_measured[core]).astype(np.uint8),
             }
             for name, values in bands.items():
                 parts.write(name, window, values)
-            certain = lod[own][cells.is_certain[own]]
+            certain = lod[core][cells.is_certain[core]]
             levels.append(certain[:: max(len(certain) * len(windows) // _MOST_LEVELS, 1)])
             task.advance()
     for name in ("difference", "sigma", "lod"):
@@ -329,9 +329,9 @@ def _counted(
         surfaces = Surfaces(grid.crs, risen_m, noise.length_m)
         contradicts = contradicted(tied, found.regions, found.polygons, surfaces)
     kept = [index for index in range(len(found.regions)) if index not in contradicts.whole]
-    left, doubtful = without_doubtful(found, contradicts.whole, DOUBTED, noise, grid.cell_m2)
-    partly = [one.name for one, index in zip(left.regions, kept, strict=True) if index in contradicts.part]
-    return left, doubtful, partly
+    remaining, doubtful = without_doubtful(found, contradicts.whole, DOUBTED, noise, grid.cell_m2)
+    partly = [one.name for one, index in zip(remaining.regions, kept, strict=True) if index in contradicts.part]
+    return remaining, doubtful, partly
 
 
 def _doubted(change: Change, found: FoundRegions, doubtful: DoubtfulRegions, partly: list[str]) -> Iterator[Remark]:

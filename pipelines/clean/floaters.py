@@ -136,14 +136,14 @@ def _pose(renderer: ModelRenderer, index: int) -> Tensor:
 def _error_by_opacity(renderer: ModelRenderer, backend: Rasterizer, index: int, pose: Tensor) -> Tensor:
     """Return opacity times the derivative of the squared error by it (N,), of one view."""
     model = renderer.model
-    shown = renderer.gaussians.to(backend.device).detached()
-    shown.logit_opacities = shown.logit_opacities.clone().requires_grad_()
+    gaussians = renderer.gaussians.to(backend.device).detached()
+    gaussians.logit_opacities = gaussians.logit_opacities.clone().requires_grad_()
     photo, mask = (values.to(backend.device) for values in photograph_and_mask(renderer, index))
     settings = RasterSettings(model.sh_degree, model.background)
     with torch.enable_grad():
-        render = backend.render(shown, pose, renderer.pinholes.of(index), settings)
+        render = backend.render(gaussians, pose, renderer.pinholes.of(index), settings)
         difference = through_lens(renderer, index, render.colour) - photo
         error = (difference.square().sum(dim=2) * mask).sum()
-        (by_logit,) = torch.autograd.grad(error, shown.logit_opacities)
+        (by_logit,) = torch.autograd.grad(error, gaussians.logit_opacities)
     # ∂o/∂logit = o (1 − o)
-    return by_logit / (1 - torch.sigmoid(shown.logit_opacities.detach())).clamp_min(1e-3)
+    return by_logit / (1 - torch.sigmoid(gaussians.logit_opacities.detach())).clamp_min(1e-3)

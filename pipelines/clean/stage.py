@@ -110,9 +110,9 @@ def run(stage: StageRun, options: CleanOptions) -> Summary:
     without = mean_psnr(clean, compared, progress)
     fewer = clean.gaussians
     if evidence is not None and options.gaussians is not None:
-        rows, shown = np.flatnonzero(reason == KEPT), evidence.weight_px[reason == KEPT]
-        reason[rows[~most_shown(shown, options.gaussians)]] = CONSOLIDATED
-        fewer = consolidated(fewer, shown, options.gaussians)
+        rows, weight_px = np.flatnonzero(reason == KEPT), evidence.weight_px[reason == KEPT]
+        reason[rows[~most_shown(weight_px, options.gaussians)]] = CONSOLIDATED
+        fewer = consolidated(fewer, weight_px, options.gaussians)
     smaller = _smaller(clean, fewer, backend, options, progress)
     made = smaller.gaussians
     after = without if smaller is clean else mean_psnr(smaller, compared, progress)
@@ -182,14 +182,14 @@ def _reasons(
         reason[~crop.keeps(gaussians.means.numpy())] = OUTSIDE
     reason[opacity < options.min_opacity] = TRANSPARENT
     if options.floaters and evidence is not None:
-        left = np.flatnonzero(reason == KEPT)
-        some = gaussians.select(torch.from_numpy(left))
+        kept = np.flatnonzero(reason == KEPT)
+        some = gaussians.select(torch.from_numpy(kept))
         before = before_surface(some, _measured(workspace, progress), options.floater_sigma)
         alone = isolated(some.means.numpy(), np.exp(some.log_scales.amax(dim=1).numpy()))
-        doubtful = (opacity[left] < _TRANSLUCENT) | (evidence.mean_error[left] > _CONTRADICTED)
+        doubtful = (opacity[kept] < _TRANSLUCENT) | (evidence.mean_error[kept] > _CONTRADICTED)
         floats = _floating(before, alone, doubtful)
-        reason[left[floats & alone]] = ISOLATED
-        reason[left[floats & before]] = BEFORE_SURFACE
+        reason[kept[floats & alone]] = ISOLATED
+        reason[kept[floats & before]] = BEFORE_SURFACE
     return reason
 
 
@@ -214,17 +214,17 @@ def _measured(workspace: Workspace, progress: Progress) -> Iterator[MeasuredView
 
 
 def _smaller(
-    clean: ModelRenderer, left: Gaussians, backend: Rasterizer, options: CleanOptions, progress: Progress
+    clean: ModelRenderer, kept: Gaussians, backend: Rasterizer, options: CleanOptions, progress: Progress
 ) -> ModelRenderer:
     """Return the renderer of the Gaussians that are left, without harmonics above the degree of the options.
 
     Where anything is missing now, what is left is fitted to the renders of the renderer `clean`.
     """
     degree = clean.model.sh_degree if options.sh_degree is None else options.sh_degree
-    count = coefficient_count(min(degree, left.sh_degree))
-    if len(left) == len(clean.gaussians) and count == left.sh.shape[1]:
+    count = coefficient_count(min(degree, kept.sh_degree))
+    if len(kept) == len(clean.gaussians) and count == kept.sh.shape[1]:
         return clean
-    cut = replace(left, sh=left.sh[:, :count].contiguous())
+    cut = replace(kept, sh=kept.sh[:, :count].contiguous())
     views = clean.model.indices("train")
     order = shuffled_passes(len(views), options.refit_passes, np.random.default_rng(0))
 

@@ -105,8 +105,8 @@ class Bands:
 
     def described(self) -> tuple[Band, ...]:
         """Return the bands of the file."""
-        own = tuple(lens.described() for lens in self.lenses)
-        return own if self.ndvi is None else (*own, Band("NDVI: (nir - red) / (nir + red)"))
+        bands = tuple(lens.described() for lens in self.lenses)
+        return bands if self.ndvi is None else (*bands, Band("NDVI: (nir - red) / (nir + red)"))
 
     def with_indices(self, values: Float32Array) -> Float32Array:
         """Return the values (C, H, W) of bands, and the index behind them if there is one."""
@@ -345,10 +345,10 @@ def _instants(
 def _remarks(rig: _RigModel, bands: Bands) -> tuple[Remark, ...]:
     """Return what the values of the bands are not: reflectance, comparable, of a stated unit."""
     remarks = []
-    own = {row: radiometry for row, (_, radiometry) in rig.stated.items()}
+    of_row = {row: radiometry for row, (_, radiometry) in rig.stated.items()}
     if counts := [lens.sensor for lens in bands.lenses if lens.quantity == "counts"]:
-        without = [row for row in own if rig.sensor[row] in counts and own[row].quantity == "counts"]
-        missing = ", ".join(own[without[0]].missing) if without else "one scale in common"
+        without = [row for row in of_row if rig.sensor[row] in counts and of_row[row].quantity == "counts"]
+        missing = ", ".join(of_row[without[0]].missing) if without else "one scale in common"
         example = f" {rig.files[without[0]].name} states no {missing}." if without else f" They lack {missing}."
         sentence = (
             f"bands.tif has counts of {', '.join(counts)} as the photographs store them, and no reflectance or "
@@ -362,7 +362,7 @@ def _remarks(rig: _RigModel, bands: Bands) -> tuple[Remark, ...]:
             f"reflectance by {factor}, which only the photograph of a calibrated panel tells."
         )
         remarks.append(Remark(code="bands-relative", sentence=sentence))
-    if assumed := [radiometry for radiometry in own.values() if radiometry.float_degrees]:
+    if assumed := [radiometry for radiometry in of_row.values() if radiometry.float_degrees]:
         unit = "kelvin" if assumed[0].offset else "degrees Celsius"
         sentence = f"The thermal photographs hold numbers without a unit: {unit} are assumed, by their values."
         remarks.append(Remark(code="bands-degrees-assumed", sentence=sentence))

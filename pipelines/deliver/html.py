@@ -122,13 +122,13 @@ def fitted(whole: SplatArrays, most_bytes: int, psnr_db: Measure, *, mip_filter:
     Args:
         psnr_db: of the renders of the splat that is held against those of the whole.
     """
-    own = _degree(whole)
-    for degree in range(own, -1, -1):
+    highest = _degree(whole)
+    for degree in range(highest, -1, -1):
         held = replace(whole, sh=whole.sh[:, : coefficient_count(degree)])
         spz = encode_wide_spz(held, mip_filter=mip_filter)
         if len(spz) <= most_bytes:
-            loss = None if degree == own else psnr_db(decode_spz(spz), whole)
-            return HeldSplat(spz, len(held), len(whole), degree, own, loss)
+            loss = None if degree == highest else psnr_db(decode_spz(spz), whole)
+            return HeldSplat(spz, len(held), len(whole), degree, highest, loss)
     contents: dict[str, SplatArrays] = {}
 
     def keep(name: str, content: SplatArrays, *, is_leaf: bool) -> None:
@@ -140,7 +140,7 @@ def fitted(whole: SplatArrays, most_bytes: int, psnr_db: Measure, *, mip_filter:
         merged = joined_rows([contents[tile.name] for tile in best_cut(root, most)])
         spz = encode_wide_spz(merged, mip_filter=mip_filter)
         if len(spz) <= most_bytes:
-            return HeldSplat(spz, len(merged), len(whole), 0, own, psnr_db(decode_spz(spz), whole))
+            return HeldSplat(spz, len(merged), len(whole), 0, highest, psnr_db(decode_spz(spz), whole))
         most = min(int(0.95 * most), len(merged) - 1)
     message = f"The page does not fit, even with {root.count} Gaussians."
     remedy = "Give a larger limit."
@@ -159,9 +159,9 @@ class _Views:
         axes_from_model = Similarity(1.0, ENU_FROM_Y_UP.T) @ placement.file_from_model
         rotations = poses.cam_from_model @ axes_from_model.rotation.T
         centers = axes_from_model.apply(poses.cam_center_in_model)
-        shown = np.unique(np.linspace(0, len(centers) - 1, _VIEWS).round().astype(int))
-        self._poses = [torch.tensor(pose_matrix(rotations[i], centers[i]), dtype=torch.float32) for i in shown]
-        self._pinholes = [_pinhole(sparse.camera_of(int(i))).limited(_VIEW_PX) for i in shown]
+        chosen = np.unique(np.linspace(0, len(centers) - 1, _VIEWS).round().astype(int))
+        self._poses = [torch.tensor(pose_matrix(rotations[i], centers[i]), dtype=torch.float32) for i in chosen]
+        self._pinholes = [_pinhole(sparse.camera_of(int(i))).limited(_VIEW_PX) for i in chosen]
 
     def psnr_db(self, held: SplatArrays, whole: SplatArrays) -> float:
         """Return the mean PSNR of the renders of one splat against those of another, on black."""

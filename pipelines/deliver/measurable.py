@@ -85,8 +85,8 @@ def run(stage: StageRun, options: MeasurableOptions) -> Summary:
     settings = fusion_settings(views, geo_from_model, _MIN_VIEWS, spacing_m)
     surface = _collected(fused_squares(views, geo_from_model, settings, progress), views, renderer.gaussians)
     gaussians = renderer.gaussians
-    shown = gaussians.select(_in_views(gaussians, views, renderer.backend, progress).nonzero()[:, 0])
-    replaced, discs = with_discs(shown, surface, geo_from_model, spacing_m)
+    visible = gaussians.select(_in_views(gaussians, views, renderer.backend, progress).nonzero()[:, 0])
+    replaced, discs = with_discs(visible, surface, geo_from_model, spacing_m)
     refined = refine_appearance(
         replaced,
         lambda number: _shown_view(views.view(number)),
@@ -118,14 +118,14 @@ def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None
     """
     points, gaussians = renderer.model.point_in_model(renderer.sfm), renderer.gaussians
     points = points[:: max(1, len(points) // _SAMPLED_POINTS)]
-    cameras, shown, pixels_m = renderer.model.indices("train"), np.zeros(len(points), int), []
+    cameras, views_of_point, pixels_m = renderer.model.indices("train"), np.zeros(len(points), int), []
     for pose in map(renderer.pose, cameras):
         in_cam = (points - pose.center_in_model) @ pose.cam_from_model.T
         inside = pose.pinhole.contains(pose.pinhole.project(in_cam))
-        shown += inside
+        views_of_point += inside
         if inside.any():
             pixels_m.append(np.median(in_cam[inside, 2]) / pose.pinhole.fx)
-    seen = renderer.geo_from_model.apply(points[shown >= _MIN_VIEWS])[:, :2]
+    seen = renderer.geo_from_model.apply(points[views_of_point >= _MIN_VIEWS])[:, :2]
     low, high = np.quantile(seen, [0.01, 0.99], axis=0) if len(seen) else (0.0, 0.0)
     ground = seen[((seen >= low) & (seen <= high)).all(axis=1)]
     if len(ground) < _LEAST_POINTS:
@@ -138,7 +138,7 @@ def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None
     pass_s = iteration_seconds(float(np.mean(pixels)), count, len(cameras), surface=False)  # over one view
     passes: float | None = options.appearance_passes
     if passes is None:
-        passes = passes_showing(float(shown[shown >= _MIN_VIEWS].mean()))
+        passes = passes_showing(float(views_of_point[views_of_point >= _MIN_VIEWS].mean()))
     seconds = (passes + _OTHER_PASSES) * len(cameras) * pass_s
     return (
         f"about {discs} discs {spacing_m:.3f} m apart, {size_bytes / 1e6:.3g} MB and {about(seconds)}; a larger "
@@ -187,8 +187,8 @@ def _in_views(gaussians: Gaussians, views: SurfaceViews, backend: Rasterizer, pr
         for number in range(len(views)):
             view = views.view(number)
             no_error = torch.zeros(view.pinhole.height, view.pinhole.width)
-            shown = view_contributions(gaussians, _pose(view), view.pinhole, no_error, backend)
-            most_px = torch.maximum(most_px, shown.weight_px.cpu())
+            contributions = view_contributions(gaussians, _pose(view), view.pinhole, no_error, backend)
+            most_px = torch.maximum(most_px, contributions.weight_px.cpu())
             task.advance()
     return most_px >= _LEAST_SHOWN_PX
 

@@ -102,20 +102,22 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
         written, sigma, rgb = described.result()
         covered, surface_faces = (simple, len(simple.faces)) if base_m is None else closed(simple, base_m)
         texel_m = max(points.spacing_m, pixel_m)
-        shown = textured(covered, views, placement.file_from_model, texel_m, progress, surface_faces=surface_faces)
+        mesh_with_texture = textured(
+            covered, views, placement.file_from_model, texel_m, progress, surface_faces=surface_faces
+        )
         surface = _Surface(whole, simple, *errors.result(), islands, holes.result())
     whole, simple = written, covered
     views.close()
     cautions = union(placement.cautions, without_sigma("The mesh states no σ of its vertices", no_sigma))
     exact = replace(surface, rms_error_m=0.0, largest_error_m=0.0)
     of_whole, figures = (
-        of_file.figures(mesh, points.spacing_m, shown.texel_m, watertight=options.watertight)
+        of_file.figures(mesh, points.spacing_m, mesh_with_texture.texel_m, watertight=options.watertight)
         for of_file, mesh in ((exact, whole), (surface, simple))
     )
     in_frame = {**dict(placement.sidecar()), "cautions": cautions}
     write_mesh_ply(folder / Path(MESH).name, whole.vertices, whole.faces, rgb, double=False, sigma=sigma)
     write_sidecar(MeshSidecar(**in_frame, mesh=of_whole), folder / Path(MESH).name)
-    _write_textured(folder, shown, MeshSidecar(**in_frame, mesh=figures), obj=options.obj)
+    _write_textured(folder, mesh_with_texture, MeshSidecar(**in_frame, mesh=figures), obj=options.obj)
     if target is not None:
         xyz, path = target.xyz_from_geo(geo_from_file.apply(whole.vertices)), folder / "mesh_crs.ply"
         write_mesh_ply(path, xyz, whole.faces, rgb, double=True, sigma=sigma)
@@ -127,7 +129,7 @@ def run(stage: StageRun, options: ExportMeshOptions) -> Summary:
         "vertices": len(simple.vertices),
         "area_ha": area.hectares,
         "islands_left_out": surface.islands,
-        "texture_px": len(shown.image),
+        "texture_px": len(mesh_with_texture.image),
         "crs": None if target is None else target.crs.name,
     }
     key = (

@@ -130,8 +130,8 @@ def _target(options: CrsOptions, survey: Survey, center_in_geo: FloatArray, poin
         "+datum=WGS84 +units=m +no_defs"
     )
     vertical = options.vertical or VerticalChoice(ELLIPSOIDAL, None)
-    own = options.model_copy(update={"crs": around, "vertical": vertical})
-    return target_crs(own, survey.origin, center_in_geo, survey.vertical)
+    around_scene = options.model_copy(update={"crs": around, "vertical": vertical})
+    return target_crs(around_scene, survey.origin, center_in_geo, survey.vertical)
 
 
 class _Map:

@@ -218,13 +218,13 @@ def _policy(program: str, cesium: str) -> str:
     """
     script = _SCRIPT.search(program)
     assert script is not None
-    own = base64.b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
+    digest = base64.b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
     library = quote(cesium, safe="/:@[]%") if urlsplit(cesium).netloc else "'self'"
     files = "'self'" if library == "'self'" else f"'self' {library}"
     return "; ".join(
         (
             "default-src 'none'",
-            f"script-src 'sha256-{own}' 'unsafe-eval' blob: {library}",
+            f"script-src 'sha256-{digest}' 'unsafe-eval' blob: {library}",
             f"worker-src blob: {library}",
             f"connect-src {files} blob: data:",
             f"img-src {files} blob: data:",

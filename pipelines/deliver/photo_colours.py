@@ -224,8 +224,8 @@ class PhotoColours:
         detail, camera = self._detail(point_in_model, views, wanted)
         known = camera >= 0
         colours = np.where(known[..., None], base + detail, np.float32(np.nan)).astype(np.float32)
-        own = tuple(slice(start, start + size) for start, size in zip(before, height.shape, strict=True))
-        return CellColours(np.moveaxis(colours[own], 2, 0), camera[own])
+        core = tuple(slice(start, start + size) for start, size in zip(before, height.shape, strict=True))
+        return CellColours(np.moveaxis(colours[core], 2, 0), camera[core])
 
     def _places(self, frame: RasterFrame, height: FloatArray) -> Float32Array:
         """Return the places (H, W, 3) of cells in `model`; NaN: no surface."""
@@ -246,8 +246,8 @@ class PhotoColours:
         coarse = point_in_model[BLOCK // 2 :: BLOCK, BLOCK // 2 :: BLOCK].reshape(-1, 3)
         coarse = coarse[np.isfinite(coarse[:, 0])]
         weights = []
-        shown = [number for number, camera in enumerate(self._source.views.cameras) if self._pictures.has(camera)]
-        for number in shown if len(coarse) else ():
+        usable = [number for number, camera in enumerate(self._source.views.cameras) if self._pictures.has(camera)]
+        for number in usable if len(coarse) else ():
             view = self._view(number)
             u, v, z, cosine = self._seen_at(view, coarse)
             weight = np.where(z > 0, view.weight(u, v, z, cosine), 0.0)
@@ -271,8 +271,8 @@ class PhotoColours:
             part = sparse[rows, columns]
             if not part.size:
                 continue
-            colour, shown, weight = self._colours(view, part)
-            weight *= shown
+            colour, visible, weight = self._colours(view, part)
+            weight *= visible
             side = BLOCK // _EVERY
             above, across = (slice(cells.start // side, cells.stop // side) for cells in (rows, columns))
             total = _block_sums(weight > 0, side)
@@ -308,25 +308,25 @@ class PhotoColours:
         best = np.zeros(point_in_model.shape[:2], dtype=np.float32)
         highest = wanted.max(axis=0, initial=0.0)
         for view, weight in zip(views, wanted, strict=True):
-            asked = binary_dilation((weight > 0) & (weight >= _BEST * highest), np.ones((3, 3)))
-            rows, columns = _box(asked, BLOCK)
+            near_best = binary_dilation((weight > 0) & (weight >= _BEST * highest), np.ones((3, 3)))
+            rows, columns = _box(near_best, BLOCK)
             part = point_in_model[rows, columns]
             if not part.size:
                 continue
-            colour, shown, _ = self._colours(view, part)
+            colour, visible, _ = self._colours(view, part)
             # Hidden specks are noise of the surface: without them, photographs change at fewer places.
             square = np.ones((_SPECK, _SPECK), dtype=np.uint8)
-            shown = np.asarray(cv2.morphologyEx(shown, cv2.MORPH_CLOSE, square), dtype=np.float32)
+            visible = np.asarray(cv2.morphologyEx(visible, cv2.MORPH_CLOSE, square), dtype=np.float32)
             blocks = tuple(slice(cells.start // BLOCK, cells.stop // BLOCK) for cells in (rows, columns))
-            own = shown * cv2.resize(weight[blocks], shown.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            score = visible * cv2.resize(weight[blocks], visible.shape[::-1], interpolation=cv2.INTER_LINEAR)
             before = best[rows, columns]
-            better = own > before
-            now = np.maximum(own, before)
-            if not (own > 0).any():
+            better = score > before
+            now = np.maximum(score, before)
+            if not (score > 0).any():
                 continue
             # Weights by a high power: the best view alone, but for the few cells where two are equally good.
-            kept, added = ((values / np.maximum(now, _TINY)) ** _SHARPNESS for values in (before, own))
-            fine = colour - _block_means(colour, shown > 0)
+            kept, added = ((values / np.maximum(now, _TINY)) ** _SHARPNESS for values in (before, score))
+            fine = colour - _block_means(colour, visible > 0)
             detail[rows, columns] = kept[..., None] * detail[rows, columns] + added[..., None] * fine
             total[rows, columns] = kept * total[rows, columns] + added
             camera[rows, columns][better] = view.seen.camera
@@ -339,11 +339,11 @@ class PhotoColours:
         """Return colours (H, W, C) of a view at places (H, W, 3), whether it shows them, and weights."""
         u, v, z, cosine = self._seen_at(view, point_in_model.reshape(-1, 3))
         u, v, z, cosine = (values.reshape(point_in_model.shape[:2]) for values in (u, v, z, cosine))
-        shown, weight = view.shows(u, v, z), view.weight(u, v, z, cosine)
+        visible, weight = view.shows(u, v, z), view.weight(u, v, z, cosine)
         colour, factor = self._pictures.at(view.seen.camera, view.pinhole, u, v, z)
         if factor is not None:
             weight = weight * factor
-        return colour, np.where(weight > 0, shown, np.float32(0.0)), weight
+        return colour, np.where(weight > 0, visible, np.float32(0.0)), weight
 
     def _reach(self, view: _View, point_in_model: Float32Array, size: int) -> BoolArray:
         """Return the blocks (h, w) of places (H, W, 3) of which a view may show a part."""

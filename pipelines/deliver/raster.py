@@ -92,8 +92,8 @@ def run(stage: StageRun, options: ExportRasterOptions) -> Summary:
     sidecar = _sidecar(stage, model, mosaic, source, height, options=options, no_sigma=reason)
     terrain = sidecar if source.terrain is None else _sidecar_of_terrain(sidecar, mosaic)
     sidecars = {"dtm": terrain, "sigma_dtm": terrain}
-    for path, own in mosaic.write(stage.out, lambda name: sidecars.get(name, sidecar), stage.progress):
-        write_sidecar(own, path)
+    for path, file_sidecar in mosaic.write(stage.out, lambda name: sidecars.get(name, sidecar), stage.progress):
+        write_sidecar(file_sidecar, path)
     holes = mosaic.interpolated_parts(stage.out / "measured.tif")
     replace_text(stage.out / "interpolated.geojson", features_text(holes))
     height_colours = None
@@ -155,8 +155,8 @@ def _colour(
     longest_px = max(max(camera.width, camera.height) for camera in sfm.cameras.values())
     images = photographs(sfm, survey, stage.workspace, longest_px)
     if options.colours == "photographs":
-        shown = PhotoColours(model, sfm, source, images, ColourPictures(model, sfm, source, images))
-        mosaic.colour(shown, stage.progress)
+        colours = PhotoColours(model, sfm, source, images, ColourPictures(model, sfm, source, images))
+        mosaic.colour(colours, stage.progress)
         if options.source:
             mosaic.add_source()
             replace_text(stage.out / "source.json", json.dumps(["", *sfm.image_name], indent=1))

@@ -106,13 +106,13 @@ class _Units:
 
     def tree(self, rows: list[IntArray]) -> SogNode:
         """Return the box of rows of each level: cut in two at the median along its longest side, or a leaf."""
-        own = self._levels[0].means[rows[0]]
-        if len(own) > _MOST_IN_LEAF:
-            axis = int(np.ptp(own, axis=0).argmax())
-            border = np.median(own[:, axis])
+        means = self._levels[0].means[rows[0]]
+        if len(means) > _MOST_IN_LEAF:
+            axis = int(np.ptp(means, axis=0).argmax())
+            border = np.median(means[:, axis])
             sides = [self._levels[level].means[part, axis] < border for level, part in enumerate(rows)]
             if not sides[0].any():  # half of them are at one place
-                sides[0][: len(own) // 2] = True
+                sides[0][: len(means) // 2] = True
             below = [part[side] for part, side in zip(rows, sides, strict=True)]
             above = [part[~side] for part, side in zip(rows, sides, strict=True)]
             children = (self.tree(below), self.tree(above))

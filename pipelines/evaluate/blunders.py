@@ -43,13 +43,13 @@ def find_blunders(error_in_geo: FloatArray, joint_cov: FloatArray) -> Blunders:
     wrong, doubtful = np.zeros((2, len(error)), dtype=bool)
     while (rows := np.flatnonzero(~wrong)).size >= 2 and wrong.sum() < len(error) / 2:
         misfit = _misfits(error[rows], _part(joint_cov, rows))
-        own = np.array([_scatter(error[row], _part(joint_cov, np.array([row]))) for row in rows])
-        worst = rows[np.argmax(own if len(rows) == 2 else misfit)]
+        scatter = np.array([_scatter(error[row], _part(joint_cov, np.array([row]))) for row in rows])
+        worst = rows[np.argmax(scatter if len(rows) == 2 else misfit)]
         others = rows[rows != worst]
         allowed = _SIGMAS * max(_scatter(error[others], _part(joint_cov, others)), 1.0)
         if misfit[rows == worst] <= allowed:
             break
-        if len(rows) == 2 and own[rows == worst] <= allowed:
+        if len(rows) == 2 and scatter[rows == worst] <= allowed:
             doubtful[rows] = True
             break
         wrong[worst] = True
@@ -87,10 +87,10 @@ def blunder_caution(names: Sequence[str], error_in_geo: FloatArray, blunders: Bl
     remarks = []
     if blunders.wrong.any():
         bad = [size for size, is_wrong in zip(sizes, blunders.wrong, strict=True) if is_wrong]
-        left = len(sizes) - len(bad)
+        rest = len(sizes) - len(bad)
         sentence = (
             f"{len(bad)} of {len(sizes)} check points disagree{'s' if len(bad) == 1 else ''} with the solution far "
-            f"beyond σ, while the other {left} agree{'s' if left == 1 else ''}: {listed(bad)}. Check coordinate, "
+            f"beyond σ, while the other {rest} agree{'s' if rest == 1 else ''}: {listed(bad)}. Check coordinate, "
             "name and marks. The accuracy is stated with and without."
         )
         remarks.append(Remark(code="check-point-blunder", sentence=sentence))

@@ -297,9 +297,9 @@ def cautions_of_prediction(
     joint = jointly_checked(survey, posterior)
     if joint is None:
         return ()
-    found = find_blunders(joint.error_in_geo, joint.cov)
-    named = blunder_caution(joint.names, joint.error_in_geo, found)
-    others = joint.without(frozenset(compress(joint.names, found.wrong | found.doubtful)))
+    wrong_points = find_blunders(joint.error_in_geo, joint.cov)
+    named = blunder_caution(joint.names, joint.error_in_geo, wrong_points)
+    others = joint.without(frozenset(compress(joint.names, wrong_points.wrong | wrong_points.doubtful)))
     blunders = frozenset(triangulated.blunders) & frozenset(others.names)
     test = chi2_caution(others.names, others.error_in_geo.ravel(), others.cov, blunders)
     return named if test is None else (*named, test)

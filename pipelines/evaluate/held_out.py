@@ -46,9 +46,11 @@ def _errors_in(renderer: ModelRenderer, view: int, point: FloatArray, normal: Fl
     inside = pose.pinhole.contains(xy)
     pixel = np.floor(xy[inside]).astype(np.int64)
     depth_m = depth[pixel[:, 1], pixel[:, 0]]
-    shown = pose.center_in_model + depth_m[:, None] * (pose.pinhole.rays(pixel + 0.5) @ pose.cam_from_model)
+    surface_in_model = pose.center_in_model + depth_m[:, None] * (
+        pose.pinhole.rays(pixel + 0.5) @ pose.cam_from_model
+    )
     off_m = np.full(len(point), np.nan)
-    distance = np.einsum("pi,pi->p", shown - point[inside], normal[inside])
+    distance = np.einsum("pi,pi->p", surface_in_model - point[inside], normal[inside])
     off_m[inside] = np.where(depth_m > 0, distance, np.nan)
     return off_m
 

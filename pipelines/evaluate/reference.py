@@ -151,8 +151,10 @@ def _model(
     similarity, shift = alignment
     moved = TiledPoints(scratch / "moved", delivered.side_m)
     for name in sorted(delivered.count):
-        rows, own = delivered.around(name, 0.0)
-        moved.append(similarity.apply(rows["position"][own]), rows["normal"][own] @ similarity.rotation.T, None)
+        rows, inside = delivered.around(name, 0.0)
+        moved.append(
+            similarity.apply(rows["position"][inside]), rows["normal"][inside] @ similarity.rotation.T, None
+        )
     return moved, settings, shift, similarity
 
 

@@ -100,14 +100,14 @@ def compare_square(
 ) -> SquareDistances:
     """Return the distances between both clouds in a square of the plan; points around it are neighbours only."""
     margin_m = FARTHEST_M + 3 * settings.core_m
-    rows, own = reference.around(square, margin_m)
+    rows, inside = reference.around(square, margin_m)
     every = at_random(rows["position"])
     kept = first_of_voxels(rows["position"], settings.voxel_m)
-    rows, own = rows[kept], own[kept]
+    rows, inside = rows[kept], inside[kept]
     model_rows, model_own = model.around(square, margin_m)
     position, normal, kinds = rows["position"], *_surface(rows, model_rows, settings)
     is_seen = np.zeros(len(rows), dtype=bool)
-    is_seen[own] = seen.sees(position[own])
+    is_seen[inside] = seen.sees(position[inside])
     to_model, _ = _nearest(position[is_seen], model_rows["position"])
     covered = model_own & _covered(model_rows["position"], position, settings.cover_m)
     to_reference, nearest = _nearest(model_rows["position"][covered], position)
@@ -122,7 +122,7 @@ def compare_square(
         rows_of(kinds, nearest),
         to_model,
         rows_of(kinds, is_seen),
-        int(own.sum()),
+        int(inside.sum()),
         CorePoints(position[cores], normal[cores], distance_m, noise_m, rows_of(kinds, cores)),
     )
 

@@ -366,8 +366,10 @@ def _note_differences(bag: BagFiles, metadata: _Metadata, storages: set[str]) ->
         parts.append(f"storage_identifier {metadata.storage!r} for {' and '.join(sorted(storages))}")
     counted = {topic: count for topic, (_, count) in metadata.topics.items()}
     wrong = [topic for topic in counted.keys() | held.keys() if counted.get(topic, 0) != held.get(topic, 0)]
-    shown = [f"{topic} {counted.get(topic, 0)} for {held.get(topic, 0)} messages" for topic in sorted(wrong)]
-    parts += shown[:_SHOWN] + ([f"{len(shown) - _SHOWN} more topics"] if len(shown) > _SHOWN else [])
+    differences = [f"{topic} {counted.get(topic, 0)} for {held.get(topic, 0)} messages" for topic in sorted(wrong)]
+    parts += differences[:_SHOWN] + (
+        [f"{len(differences) - _SHOWN} more topics"] if len(differences) > _SHOWN else []
+    )
     other = sum(
         _quality_differs(bag.storages, topic, metadata.quality[topic]) for topic in counted.keys() & held.keys()
     )

@@ -198,10 +198,10 @@ def _geojson(data: bytes, refusal: Refusal) -> _Shapes:
     unreadable = partial(refusal, "boundary-unreadable")
     try:
         document = json.loads(data)
-        pending, shapes, own = [document], [], []
+        pending, shapes, crs_members = [document], [], []
         while pending:
             item = pending.pop()
-            own += [item["crs"]] if "crs" in item else []
+            crs_members += [item["crs"]] if "crs" in item else []
             if item["type"] == "FeatureCollection":
                 pending += item["features"][::-1]
             elif item["type"] == "Feature":
@@ -214,9 +214,9 @@ def _geojson(data: bytes, refusal: Refusal) -> _Shapes:
         message = f"cannot be read as GeoJSON: {type(error).__name__} {str(error)[:100]}."
         remedy = "Write it again."
         raise unreadable(message, remedy=remedy) from error
-    if not own:
+    if not crs_members:
         return _Shapes("", shapes, _WGS84, crs_is_default=True)
-    names = list(dict.fromkeys(_crs_member(member, refusal) for member in own))
+    names = list(dict.fromkeys(_crs_member(member, refusal) for member in crs_members))
     if len(names) > 1:
         raise refusal("boundary-two-crs", f"names several CRSs: {', '.join(names)}.", remedy="Give one of them.")
     return _Shapes("", shapes, names[0])

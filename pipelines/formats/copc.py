@@ -59,23 +59,23 @@ def write_copc(laz: Path, path: Path) -> int:
 
 def _nodes(xyz: FloatArray, low: FloatArray, side: float) -> Iterator[tuple[tuple[int, int, int, int], IntArray]]:
     """Yield the key (depth, x, y, z) and the rows of each node of points (N, 3) in a cube, parents first."""
-    left = np.random.default_rng(0).permutation(len(xyz))
+    remaining = np.random.default_rng(0).permutation(len(xyz))
     for depth in range(_DEEPEST + 1):
         cells = 2**depth * _SPAN
-        cell = np.clip(np.floor((xyz[left] - low) / side * cells).astype(np.int64), 0, cells - 1)
+        cell = np.clip(np.floor((xyz[remaining] - low) / side * cells).astype(np.int64), 0, cells - 1)
         node, owner, members = np.unique(_code(cell // _SPAN), return_inverse=True, return_counts=True)
         taken = members[owner] <= _FEW
         taken[np.unique(_code(cell), return_index=True)[1]] = True
         if depth == _DEEPEST:
             taken[:] = True
         order = np.argsort(owner[taken], kind="stable")
-        rows, held = left[taken][order], owner[taken][order]
+        rows, held = remaining[taken][order], owner[taken][order]
         ends = np.searchsorted(held, np.arange(len(node) + 1))
         for number, code in enumerate(node.tolist()):
             key = (depth, code >> 40, code >> 20 & 0xFFFFF, code & 0xFFFFF)
             yield key, rows[ends[number] : ends[number + 1]]
-        left = left[~taken]
-        if not len(left):
+        remaining = remaining[~taken]
+        if not len(remaining):
             return
 
 

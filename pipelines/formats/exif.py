@@ -149,8 +149,8 @@ def read_tags(data: bytes) -> PhotoTags:
     for directory in directories:
         tags = directory | tags  # the first of a name counts
     xmp = read_packets(blocks.xmp, notes.problems)
-    found = [_gps(directory, notes) for directory in directories]
-    in_exif = list(dict.fromkeys(each for each in found if each is not None))
+    of_directory = [_gps(directory, notes) for directory in directories]
+    in_exif = list(dict.fromkeys(each for each in of_directory if each is not None))
     in_xmp = _xmp_positions(xmp, notes)
     times = times_of(tags, notes.problems)
     timestamp_s, time_source = times.timestamp

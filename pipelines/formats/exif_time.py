@@ -116,8 +116,8 @@ def clock_of(text: str, fraction: str) -> tuple[float, float, float | None] | No
     part_s, step_s = 0.0, 1.0
     if match[7]:
         part_s, step_s = _fraction("", match[7])
-    elif (found := _SUBSEC.fullmatch(fraction.strip("\x00 "))) is not None:
-        part_s, step_s = _fraction(found[1], found[2])
+    elif (subsecond := _SUBSEC.fullmatch(fraction.strip("\x00 "))) is not None:
+        part_s, step_s = _fraction(subsecond[1], subsecond[2])
     zone_s = 0.0 if match[8] == "Z" else zone_of(match[8] or "")
     return whole.timestamp() + part_s, step_s, zone_s
 

@@ -67,12 +67,12 @@ def read_las_head(path: Path, size: int) -> LasHead:
             message = "The header is damaged: its records reach beyond the file's end."
             raise InputError("file-damaged", message, path=path)
         _check_steps(path, head)
-        found: _Found = {}
+        by_record: _Found = {}
         for key, data in _records(stream, head, size):
-            found.setdefault(key, []).append(data)
+            by_record.setdefault(key, []).append(data)
         is_compressed = bool(point_format & 0x80)
-        table_at = _missing_table(path, stream, offset, size, found) if is_compressed else None
-    return LasHead(_crs(head, found), table_at)
+        table_at = _missing_table(path, stream, offset, size, by_record) if is_compressed else None
+    return LasHead(_crs(head, by_record), table_at)
 
 
 def _check_steps(path: Path, head: bytes) -> None:

@@ -70,9 +70,9 @@ def placed(mesh: TriangleMesh, *, crs_stated: bool, offset_stated: bool, flag: s
         InputError: a file beside the mesh that cannot be read, or two that state different offsets.
     """
     path, vertices = mesh.path, mesh.vertices
-    own = sidecar_path(path)
-    if own.is_file() and not offset_stated and not crs_stated:
-        return _by_sidecar(path, own, vertices)
+    beside = sidecar_path(path)
+    if beside.is_file() and not offset_stated and not crs_stated:
+        return _by_sidecar(path, beside, vertices)
     stated = [PlaceFile(path, mesh.crs, mesh.offset), *_place_files(path)]
     crs = next((one.crs for one in stated if one.crs), "")
     remarks = [*_differing_crs(path, stated, flag)]
@@ -102,14 +102,14 @@ def placed(mesh: TriangleMesh, *, crs_stated: bool, offset_stated: bool, flag: s
     return PlacedVertices(vertices + shift, FileCrs(wkt=crs), tuple(remarks))
 
 
-def _by_sidecar(path: Path, own: Path, vertices: FloatArray) -> PlacedVertices:
+def _by_sidecar(path: Path, sidecar: Path, vertices: FloatArray) -> PlacedVertices:
     try:
-        in_frame = load_json(GeorefSidecar, own)
+        in_frame = load_json(GeorefSidecar, sidecar)
     except InputError:
-        in_crs = load_json(CrsSidecar, own)
+        in_crs = load_json(CrsSidecar, sidecar)
         return PlacedVertices(vertices, FileCrs(wkt=in_crs.crs_wkt))
     if in_frame.crs_id is None:
-        message = f"{own.name} says that the mesh lies in a local metric frame, without a place on Earth."
+        message = f"{sidecar.name} says that the mesh lies in a local metric frame, without a place on Earth."
         raise InputError("not-on-earth", message, path=path)
     return PlacedVertices(in_frame.ecef_from_file().apply(vertices), FileCrs(wkt=ECEF))
 
@@ -186,8 +186,8 @@ def _differing_crs(path: Path, stated: list[PlaceFile], flag: str) -> Iterator[R
     said = [one for one in stated if one.crs or one.enu is not None]
     texts = [" ".join(one.crs.split()).lower() or "enu" for one in said]
     if len(set(texts)) > 1:
-        shown = ", ".join(f"{(one.crs or 'ENU')[:60]!r} in {one.path.name}" for one in said)
-        sentence = f"{path.name}: files beside it name its CRS in different words: {shown}. The first counts."
+        listed = ", ".join(f"{(one.crs or 'ENU')[:60]!r} in {one.path.name}" for one in said)
+        sentence = f"{path.name}: files beside it name its CRS in different words: {listed}. The first counts."
         code, remedy = f"{flag.removeprefix('--')}-crs-stated-twice", f"{flag}-crs overrules them."
         yield Remark(code=code, sentence=sentence, remedy=remedy)
 
@@ -201,7 +201,7 @@ def _metres(values: FloatArray) -> str:
 
 
 def _numbers(text: str) -> list[float]:
-    numbers = [float(found) for found in _NUMBER.findall(text)[:10]]
+    numbers = [float(text_of_number) for text_of_number in _NUMBER.findall(text)[:10]]
     return numbers if all(abs(number) < 1e9 for number in numbers) else []
 
 

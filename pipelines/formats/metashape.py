@@ -266,10 +266,10 @@ def read_cameras(path: Path) -> PoseTable:
 def _reference(path: Path) -> tuple[tables.Table, bool | None]:
     """Return a reference table, and True if its header has longitudes, else None."""
     lines = tables.numbered_lines(path)
-    found = next(((at, text) for at, text in lines if HEADER.match(text)), None)
-    if found is None:
+    header_at = next(((at, text) for at, text in lines if HEADER.match(text)), None)
+    if header_at is None:
         raise InputError("header-missing", "No line begins with #Label.", path=path)
-    header_line, header = found
+    header_line, header = header_at
     crs_line, crs_text = next(((at, crs[1]) for at, text in lines if (crs := _CRS.match(text))), (1, None))
     separator = tables.separator_of(header)
     cells = tables.split(header.lstrip("# "), separator, path=path, line=header_line)

@@ -141,9 +141,7 @@ def _said_of_sensors(reader: _Reader, used: set[str]) -> list[Remark]:
     if any(sensor.rolling for sensor in sensors.values()):
         sentence = f"{PROGRAM} solved a rolling shutter: poses are taken, the motion during the readout is not."
         remarks.append(Remark(code="rolling-shutter-not-taken", sentence=sentence))
-    initial = [
-        key for key, found in sensors.items() if found.calibrations and not found.calibrations.get("adjusted")
-    ]
+    initial = [key for key, each in sensors.items() if each.calibrations and not each.calibrations.get("adjusted")]
     if initial:
         sentence = f"The lens of sensor {listed(initial)} is {PROGRAM}'s initial calibration: none was adjusted."
         remarks.append(Remark(code="lens-not-adjusted", sentence=sentence))

@@ -129,7 +129,7 @@ def read_reconstruction(path: Path, photo_size: PhotoSize) -> SolvedCameras:
     models = load_json(_Reconstructions, path).root
     if not models:
         raise InputError("no-solved-cameras", f"{OPENSFM} has solved no camera in this file.", path=path)
-    model = max(models, key=lambda found: len(found.shots))
+    model = max(models, key=lambda each: len(each.shots))
     remarks = []
     if len(models) > 1:
         sentence = (

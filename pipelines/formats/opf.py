@@ -221,16 +221,16 @@ def read_opf_points(path: Path) -> GroundPoints:
     """
     project = _project(path)
     names = _photographs(project, path)
-    found = [point for given in _all(project, _POINTS, _InputPoints, path) for point in given.gcps]
-    if not found:
+    control = [point for given in _all(project, _POINTS, _InputPoints, path) for point in given.gcps]
+    if not control:
         raise InputError("no-control-points", "The project has no control points.", path=path, field="gcps")
     points, marks = [], []
-    definitions = {point.geolocation.crs.definition for point in found}
+    definitions = {point.geolocation.crs.definition for point in control}
     if len(definitions) > 1:
         message = f"The control points are in {len(definitions)} CRSs."
         remedy = "Export those of one."
         raise InputError("several-crs", message, path=path, field="crs", remedy=remedy)
-    for point in found:
+    for point in control:
         geolocation = point.geolocation
         if geolocation.crs.geoid_height is not None:
             message = (
@@ -259,7 +259,7 @@ def read_opf_points(path: Path) -> GroundPoints:
         kind="OPF's control points",
         points=without_repeats(points, path),
         marks=tuple(marks),
-        crs_text=found[0].geolocation.crs.definition,
+        crs_text=control[0].geolocation.crs.definition,
         in_order_of_crs=True,
     )
 

@@ -72,7 +72,7 @@ def read_directory(
         return {}
     order = "<" if block[:2] == b"II" else ">"
     tags: dict[int, Tag] = {}
-    left = max(_MAX_DIRECTORY_BYTES, limit_bytes)
+    budget_bytes = max(_MAX_DIRECTORY_BYTES, limit_bytes)
     try:
         if at is None:
             (at,) = struct.unpack_from(order + "I", block, 4)
@@ -84,9 +84,9 @@ def read_directory(
                 continue
             size = _TYPES[kind][0] * values
             begin = offset + 8 if size <= 4 else struct.unpack_from(order + "I", block, offset + 8)[0]
-            if size <= min(limit_bytes, left) and begin + size <= len(block):
+            if size <= min(limit_bytes, budget_bytes) and begin + size <= len(block):
                 tags[number] = Tag(kind, block[begin : begin + size], order)
-                left -= size
+                budget_bytes -= size
     except struct.error:  # the directory itself is cut off: what was read of it counts
         pass
     return tags

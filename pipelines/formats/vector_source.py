@@ -38,9 +38,9 @@ def gdal() -> Any:
         warnings.simplefilter("ignore", RuntimeWarning)
         pyogrio.set_gdal_config_options({"GDAL_SKIP": ",".join(others)})
         _ogr._register_drivers()
-    left = set(pyogrio.list_drivers()) - _DRIVERS
-    if left:
-        raise RuntimeError(f"GDAL keeps its drivers {', '.join(sorted(left))}")
+    unwanted = set(pyogrio.list_drivers()) - _DRIVERS
+    if unwanted:
+        raise RuntimeError(f"GDAL keeps its drivers {', '.join(sorted(unwanted))}")
     return pyogrio
 
 

@@ -264,10 +264,10 @@ class _Placing:
         )
 
     def _plan_scale(self, crs: PointCrs, plan: _Statement, unit: Unit | None) -> float:
-        own = crs.horizontal_unit
-        if unit is None or unit.is_as_long_as(own):
+        crs_unit = crs.horizontal_unit
+        if unit is None or unit.is_as_long_as(crs_unit):
             return 1.0
-        if abs(unit.size / own - 1) < _NEARLY:
+        if abs(unit.size / crs_unit - 1) < _NEARLY:
             raise InputError(
                 "cloud-units-disagree",
                 f"states coordinates in {unit.name} beside {plan.name}, which is in {crs.units[0]}.",
@@ -281,14 +281,14 @@ class _Placing:
             f"state beside {plan.name}, a CRS in {crs.units[0]}.",
             f"If they are in {crs.units[0]}: {self._flag}-crs {plan.name}.",
         )
-        return unit.size / own
+        return unit.size / crs_unit
 
     def _height_scale(self, crs: PointCrs, heights: _Statement, plan_scale: float) -> float:
         """Return the stated unit of heights over that of the CRS.
 
         The whole CRS of the option states its unit too; a datum alone leaves it to the file.
         """
-        own = crs.height_unit_m
+        crs_unit_m = crs.height_unit_m
         problem = next((one.unit_problem for one in self._sources if one.unit_problem), "")
         if problem and heights is not self._option:
             raise InputError(
@@ -300,7 +300,7 @@ class _Placing:
             )
         # The user's CRS states its unit. So does a datum in feet, where one in metres is the datum's usual name.
         by_user = heights is self._option and heights is not _NOTHING
-        by_choice = self._choice is not None and self._choice.epsg is not None and own != 1.0
+        by_choice = self._choice is not None and self._choice.epsg is not None and crs_unit_m != 1.0
         if by_user or by_choice:
             return 1.0
         has_own = heights.stated_height_unit is not None
@@ -314,14 +314,14 @@ class _Placing:
                 f"{self._path.name}: heights were taken in {crs.height_unit}, as of {crs.name}: the file states a "
                 "unit of eastings and northings alone.",
             )
-        if unit is None or unit.is_as_long_as(own):
+        if unit is None or unit.is_as_long_as(crs_unit_m):
             return 1.0
         self._remark(
             "height-unit",
             f"{self._path.name}: heights were converted from {unit.name}, which the file states; {crs.name} has "
             f"them in {crs.height_unit}.",
         )
-        return unit.size / own
+        return unit.size / crs_unit_m
 
 
 def _of_text(text: str, source: str, *, path: Path | None = None, field: str | None = None) -> _Statement:

@@ -193,11 +193,11 @@ def _ellipsoid(code: int) -> Ellipsoid | None:
 @cache
 def _vertical_by_datum() -> Mapping[int, int]:
     """Return the EPSG code of the vertical CRS of each vertical datum of EPSG, heights before depths."""
-    found: dict[int, int] = {}
+    code_of: dict[int, int] = {}
     codes = sorted(int(info.code) for info in query_crs_info(auth_name="EPSG", pj_types=PJType.VERTICAL_CRS))
     for code in codes:
         crs = CRS.from_epsg(code)
         datum = crs.datum.to_json_dict().get("id", {}).get("code") if crs.datum is not None else None
         if isinstance(datum, int) and crs.axis_info[0].direction == "up":
-            found.setdefault(datum, code)
-    return found
+            code_of.setdefault(datum, code)
+    return code_of

@@ -303,8 +303,8 @@ def _common_covariance(
     shared = cameras.cov_center_in_geo @ np.swapaxes(common.gain, 1, 2)
     by_center = bundle.sum_by_point(response @ shared[bundle.view])
     cross = by_center @ np.swapaxes(by_rotation, 1, 2)
-    own = by_rotation @ common.cov_rad2 @ np.swapaxes(by_rotation, 1, 2)
-    return np.asarray(own + cross + np.swapaxes(cross, 1, 2))
+    of_rotation = by_rotation @ common.cov_rad2 @ np.swapaxes(by_rotation, 1, 2)
+    return np.asarray(of_rotation + cross + np.swapaxes(cross, 1, 2))
 
 
 def _largest_angle_deg(bundle: _RayBundle, used: BoolArray) -> FloatArray:

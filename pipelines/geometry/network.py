@@ -180,8 +180,8 @@ def eliminate_points(
     """
     total: EliminatedPoints | None = None
     for part, points, rows in chunks_of_points(network, _CHUNK):
-        own = None if more is None else MoreColumns(more.of_photograph[rows], more.shared[rows])
-        sums = _eliminated(part, root_weight[rows], None if surveyed is None else surveyed[points], ridge, own)
+        columns = None if more is None else MoreColumns(more.of_photograph[rows], more.shared[rows])
+        sums = _eliminated(part, root_weight[rows], None if surveyed is None else surveyed[points], ridge, columns)
         if total is not None:
             sums = EliminatedPoints(*map(operator.add, vars(total).values(), vars(sums).values()))
         total = sums
@@ -232,13 +232,13 @@ def _eliminated(
     white = by_point @ inverse_root[network.obs_point]
     transposed = np.swapaxes(by_pose, 1, 2)
     pose_point = _blocks(transposed @ white, network.obs_image, network.obs_point, (n, points))
-    own = _blocks(transposed @ by_pose, network.obs_image, network.obs_image, (n, n))
+    pose_pose = _blocks(transposed @ by_pose, network.obs_image, network.obs_image, (n, n))
     pose = sparse_jacobian(by_pose, network.obs_image, n)
     intrinsics_point = intrinsics.T @ sparse_jacobian(white, network.obs_point, points)
     by_similarity = jacobian_at(network.point_in_world, network.cam_center_in_world.mean(axis=0))
     moved = (np.swapaxes(root, 1, 2) @ by_similarity).reshape(3 * points, 7)
     return EliminatedPoints(
-        own - pose_point @ pose_point.T,
+        pose_pose - pose_point @ pose_point.T,
         (pose.T @ intrinsics - pose_point.tocsr() @ intrinsics_point.T).toarray(),
         (intrinsics.T @ intrinsics - intrinsics_point @ intrinsics_point.T).toarray(),
         pose_point @ moved,

@@ -96,12 +96,19 @@ def with_row_motion(
         modes=whole.modes,
     )
     coupling = np.concatenate([every[motion][:, pose].toarray(), whole.cross[motion, :-1]], axis=1)
-    own, gradient = every[motion][:, motion].toarray(), np.concatenate([whole.cross[pose, -1], whole.lens[:-1, -1]])
-    return sums, _estimated(sums, own, coupling, gradient, whole.cross[motion, -1])
+    motion_motion, gradient = (
+        every[motion][:, motion].toarray(),
+        np.concatenate([whole.cross[pose, -1], whole.lens[:-1, -1]]),
+    )
+    return sums, _estimated(sums, motion_motion, coupling, gradient, whole.cross[motion, -1])
 
 
 def _estimated(
-    sums: EliminatedPoints, own: FloatArray, coupling: FloatArray, gradient: FloatArray, by_motion: FloatArray
+    sums: EliminatedPoints,
+    motion_motion: FloatArray,
+    coupling: FloatArray,
+    gradient: FloatArray,
+    by_motion: FloatArray,
 ) -> RowMotion | None:
     """Return the motion of the rows from its information (2 n, 2 n), and gradients by poses and lens, and by m."""
     information = np.block([[sums.poses.toarray(), sums.cross], [sums.cross.T, sums.lens]])
@@ -112,7 +119,9 @@ def _estimated(
     scaled_coupling = coupling[:, used] * scale
     follows = cho_solve(cho_factor(scaled), scaled_coupling.T)
     response = scaled_coupling @ follows
-    left, slope = _observed(own, own - response, by_motion - follows.T @ (gradient[used] * scale))
+    left, slope = _observed(
+        motion_motion, motion_motion - response, by_motion - follows.T @ (gradient[used] * scale)
+    )
     spread2 = float((left**2).sum())
     excess = float(slope @ slope - np.trace(left))
     if spread2 <= 0 or excess <= _BY_CHANCE * (2.0 * spread2) ** 0.5:
@@ -135,13 +144,16 @@ def _estimated(
     )
 
 
-def _observed(own: FloatArray, left: FloatArray, slope: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _observed(motion_motion: FloatArray, reduced: FloatArray, slope: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return information (2 n, 2 n) and gradient (2 n,) along what poses and lens do not take up.
 
     The motion that all photographs of parallel lines share is taken up nearly as a whole. What is left of it in the
     residuals is no measurement, but how near to its minimum SfM has ended.
     """
-    part, axes = eigh((left + left.T) / 2, own + _RIDGE * np.trace(own) / len(own) * np.eye(len(own)))
+    part, axes = eigh(
+        (reduced + reduced.T) / 2,
+        motion_motion + _RIDGE * np.trace(motion_motion) / len(motion_motion) * np.eye(len(motion_motion)),
+    )
     seen = part > _LEAST_PART
-    across = own @ axes[:, seen]
+    across = motion_motion @ axes[:, seen]
     return across * part[seen] @ across.T, across @ (axes[:, seen].T @ slope)

@@ -118,15 +118,15 @@ def _apart(best: _Receiver, other: _Receiver) -> tuple[float, float] | None:
     """Return how far another receiver is from the best one, horizontally and upwards in metres (medians)."""
     if len(best.fixes) < 2 or not other.fixes:
         return None
-    own, its = np.array(best.fixes), np.array(other.fixes)
-    order = np.argsort(own[:, 0])
-    inside = (its[:, 0] >= own[order[0], 0]) & (its[:, 0] <= own[order[-1], 0])
+    fixes, its = np.array(best.fixes), np.array(other.fixes)
+    order = np.argsort(fixes[:, 0])
+    inside = (its[:, 0] >= fixes[order[0], 0]) & (its[:, 0] <= fixes[order[-1], 0])
     if not inside.any():
         return None
-    origin = Origin(lat_deg=own[0, 1], lon_deg=own[0, 2], alt_m=own[0, 3])
-    position = enu_from_ecef(ecef_from_lla(own[order, 1:]), origin)
+    origin = Origin(lat_deg=fixes[0, 1], lon_deg=fixes[0, 2], alt_m=fixes[0, 3])
+    position = enu_from_ecef(ecef_from_lla(fixes[order, 1:]), origin)
     there: FloatArray = enu_from_ecef(ecef_from_lla(its[inside, 1:]), origin)
-    at = np.column_stack([np.interp(its[inside, 0], own[order, 0], position[:, axis]) for axis in range(3)])
+    at = np.column_stack([np.interp(its[inside, 0], fixes[order, 0], position[:, axis]) for axis in range(3)])
     shift = np.median(there - at, axis=0)
     return float(math.hypot(*shift[:2])), float(shift[2])
 

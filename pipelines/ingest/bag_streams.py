@@ -299,9 +299,9 @@ def read_streams(bag: Bag, options: IngestOptions, remarks: Remarks, progress: P
             task.advance()
             read[message.topic] += 1
             try:
-                if (shown := pictures.get(message.topic)) is not None:
-                    shown.add(bag.header_stamp_ns(message), message.bag_ns)
-                    shown.frame = shown.frame or _frame(bag, message)
+                if (stamps := pictures.get(message.topic)) is not None:
+                    stamps.add(bag.header_stamp_ns(message), message.bag_ns)
+                    stamps.frame = stamps.frame or _frame(bag, message)
                 elif message.topic in lenses:
                     infos[message.topic] = infos.get(message.topic) or bag.decode(message)
                 elif message.topic in frames:
@@ -330,9 +330,9 @@ def _note_files(bag: Bag, options: IngestOptions, remarks: Remarks) -> None:
         (options.attitude_topic, ATTITUDES), (None, (INFO, *TRANSFORM_TYPES)),
     )  # fmt: skip
     for topic in bag.lost.values():
-        asked = [named for named, types in roles if topic.type in types]
+        roles_of_type = [named for named, types in roles if topic.type in types]
         sentence = f"metadata.yaml counts {topic.count} messages of {topic.name}, and the data files have none."
-        if any(named in (None, topic.name) for named in asked):
+        if any(named in (None, topic.name) for named in roles_of_type):
             remedy = (
                 "Copy the bag again; if they are lost, `ros2 bag reindex` writes metadata.yaml anew without them."
             )

@@ -151,8 +151,8 @@ def _to_estimate(
 
     Only the photographs' own motion tells the latter. An InputError: what is asked for was not recorded.
     """
-    shown = shown_by(track)
-    if options.time_offset == "auto" and "time-offset" not in shown:
+    observable = shown_by(track)
+    if options.time_offset == "auto" and "time-offset" not in observable:
         raise InputError(
             "navigation-not-recorded",
             "needs navigation with times: a --bag, or a --trajectory without a column of image names",

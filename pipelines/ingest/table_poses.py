@@ -60,8 +60,8 @@ def poses_from_table(
     time_s = photo_times(photos)
     recorded, along_track_m = None, None
     if table.names is not None:
-        place = {name: row for row, name in enumerate(images)}
-        rows = [place[name] for name in table.names]
+        row_by_name = {name: row for row, name in enumerate(images)}
+        rows = [row_by_name[name] for name in table.names]
         at_images = _spread(measured, rows, len(photos))
         time_s = np.where(np.isfinite(at_images.time_s), at_images.time_s, time_s)
         row_of = dict(zip(rows, receiver, strict=True))

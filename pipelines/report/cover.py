@@ -85,7 +85,7 @@ def cover_facts(
     surface, solution = report.headline.surface, posterior.solution
     height_m, gsd_m = flying_height_m(solution.center_in_geo, scene), ground_sampling_m(solution, posterior.sparse)
     previews = {"Orthophoto": ORTHOPHOTO_PREVIEW, "Surface model": HILLSHADE}
-    shown = {name: _raster_picture(workspace, name, product) for name, product in previews.items()}
+    pictures = {name: _raster_picture(workspace, name, product) for name, product in previews.items()}
     registered = f"{count_text(lenses.photographs)} of {count_text(len(survey.images))} registered"
     control, check = (count_text(len(points)) for points in (survey.control_points, survey.check_points))
     cameras = [
@@ -98,7 +98,7 @@ def cover_facts(
         client=options.client,
         author=options.author,
         logo=None if options.logo is None else logo_picture(options.logo),
-        views=tuple((name, picture) for name, picture in shown.items() if picture is not None),
+        views=tuple((name, picture) for name, picture in pictures.items() if picture is not None),
         facts=(
             ("Area", area),
             ("Photographs", registered),

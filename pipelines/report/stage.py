@@ -170,13 +170,13 @@ def _sections_of_gaussians(
         return (), ()
     views, training = views_facts(workspace, test, options.views), training_facts(workspace, model)
     lidar = lidar_facts(workspace)
-    shown = [Section("test-views", "Test views", "views.html", views)]
+    sections = [Section("test-views", "Test views", "views.html", views)]
     if report.reference is not None:
         reference = reference_facts(workspace)
-        shown.append(Section("reference", "Surface against a reference", "reference.html", reference))
+        sections.append(Section("reference", "Surface against a reference", "reference.html", reference))
     if lidar is not None:
-        shown.append(Section("lidar", "LiDAR in the training", "lidar.html", lidar))
-    return tuple(shown), (Section("training", "Appendix: training", "training.html", training, folded=True),)
+        sections.append(Section("lidar", "LiDAR in the training", "lidar.html", lidar))
+    return tuple(sections), (Section("training", "Appendix: training", "training.html", training, folded=True),)
 
 
 @dataclass(frozen=True)

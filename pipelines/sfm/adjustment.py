@@ -236,13 +236,13 @@ def _adjust_robustly(
     """Adjust until the scale of the kernel is that of the adjustment before; once, if the cameras are settled."""
     adjustment.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
     used_px = np.inf
-    for left in reversed(range(_ROBUST_ROUNDS)):
+    for rounds_left in reversed(range(_ROBUST_ROUNDS)):
         scale_px = max(rayleigh_sigma(residual_px(model)), LEAST_SCALE_PX)
-        is_last = settled or left == 0 or abs(scale_px / used_px - 1) < _SETTLED
+        is_last = settled or rounds_left == 0 or abs(scale_px / used_px - 1) < _SETTLED
         adjustment.ceres.solver_options.function_tolerance = (1.0 if is_last else _COARSE) * _least_gain(model)
         adjustment.ceres.loss_function_scale = CAUCHY_95 * scale_px
         _adjust(colmap, model, adjustment)
-        task.advance(1 + left if is_last else 1, note=f"σ {scale_px:.2f} px")
+        task.advance(1 + rounds_left if is_last else 1, note=f"σ {scale_px:.2f} px")
         if is_last:
             return
         used_px = scale_px

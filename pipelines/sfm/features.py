@@ -219,7 +219,7 @@ def _by_pairs(
     job: SfmJob,
     pairs: IntArray,
     work: Callable[[Path], None],
-    shown: AbstractContextManager[ProgressTask],
+    progress_task: AbstractContextManager[ProgressTask],
 ) -> None:
     """Give lists of a few pairs each to a function of COLMAP, which are files.
 
@@ -229,7 +229,7 @@ def _by_pairs(
     names = [image.name for image in job.survey.images]
     rename_images(colmap, job.database, {name: _number(index) for index, name in enumerate(names)})
     try:
-        with shown as task:
+        with progress_task as task:
             for step in steps(pairs, _PAIRS_PER_STEP):
                 lines = (f"{_number(a)} {_number(b)}\n" for a, b in step)
                 listing.write_text("".join(lines), encoding="utf-8")

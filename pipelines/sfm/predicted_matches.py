@@ -250,9 +250,9 @@ class _Where:
     seen: BoolArray  # (N,)
 
 
-def _predicted(features: _Features, shown: _ModelPhotograph, other: _View, prediction: _Prediction) -> _Where:
-    view, tree = shown.view, cKDTree(shown.xy_px)
-    distance = np.linalg.norm(shown.point - view.center, axis=1)
+def _predicted(features: _Features, photograph: _ModelPhotograph, other: _View, prediction: _Prediction) -> _Where:
+    view, tree = photograph.view, cKDTree(photograph.xy_px)
+    distance = np.linalg.norm(photograph.point - view.center, axis=1)
     around = distance[tree.query(features.xy_px, k=_POINTS_AROUND)[1]]
     near, middle, far = np.quantile(around, [0.25, 0.5, 0.75], axis=1)
 

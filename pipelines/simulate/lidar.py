@@ -188,9 +188,9 @@ def _scanned_mesh(options: LidarFlightOptions, scene: SimulatedScene, changed: B
 
 def _in_footprint(building: Building, point: FloatArray, margin_m: float) -> BoolArray:
     """Return whether points (P, 3) lie above or below the building's floor, widened by a margin."""
-    own = (point - building.center) @ building.axes.T
+    in_building = (point - building.center) @ building.axes.T
     half = np.array([building.length_m, building.width_m]) / 2 + margin_m
-    return np.asarray((np.abs(own[:, :2]) <= half).all(axis=1))
+    return np.asarray((np.abs(in_building[:, :2]) <= half).all(axis=1))
 
 
 CLOUD, TRACK = "lidar.laz", "lidar_trajectory.csv"

@@ -208,8 +208,8 @@ def with_targets(
     for site, its_number in zip(sites, number.tolist(), strict=True):
         texture = quarters
         if is_tag:
-            shown = TextureParameters((0.5, 0.5, 0.5), style=style, pitch_m=width_m, shift_m=(its_number, 0.0))
-            texture = builder.add_texture(shown)
+            parameters = TextureParameters((0.5, 0.5, 0.5), style=style, pitch_m=width_m, shift_m=(its_number, 0.0))
+            texture = builder.add_texture(parameters)
         material, frame = Material.TAG if is_tag else Material.TARGET, target_axes(scene, site)
         d, c, b, a = target_corners(scene, site, board_m)
         builder.triangles(np.array([[a, b, c], [a, c, d]]), material, texture, (site.target_position, *frame))
@@ -230,9 +230,9 @@ def _on_ground(xy: tuple[float, float], terrain: Terrain, axes: FloatArray) -> F
 
 
 def _building(plan: BuildingPlan, terrain: Terrain, axes: FloatArray) -> Building:
-    own = np.stack([axes[1], -axes[0], axes[2]]) if plan.turned else axes
+    turned_axes = np.stack([axes[1], -axes[0], axes[2]]) if plan.turned else axes
     center = _on_ground(plan.center, terrain, axes)
-    return Building(center, own, plan.length_m, plan.width_m, plan.storeys, plan.floor_m, plan.roof)
+    return Building(center, turned_axes, plan.length_m, plan.width_m, plan.storeys, plan.floor_m, plan.roof)
 
 
 def _add_furniture(

@@ -204,8 +204,8 @@ def _draft(directory: Path) -> Iterator[Path]:
     """Yield a folder that becomes `directory` on success, and vanishes otherwise."""
     draft = directory.with_name(f".{directory.name}.partial")
     old = directory.with_name(f".{directory.name}.old")
-    for left in (draft, old):
-        remove(left)
+    for leftover in (draft, old):
+        remove(leftover)
     try:
         draft.mkdir(parents=True)
     except OSError as error:
@@ -217,8 +217,8 @@ def _draft(directory: Path) -> Iterator[Path]:
         sync_tree(draft)
         replace_folder(draft, directory, old)
     finally:
-        for left in (draft, old):
-            shutil.rmtree(left, ignore_errors=True)
+        for leftover in (draft, old):
+            shutil.rmtree(leftover, ignore_errors=True)
 
 
 def _write_photographs(options: SimulateOptions, flight: RecordedFlight, folder: Path, progress: Progress) -> None:

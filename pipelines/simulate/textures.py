@@ -209,10 +209,12 @@ def wall(s: TextureSamples) -> Float32Array:
     """Return a facade: plaster, masonry or panels, with plinth, windows, frames, sills, curtains and shops."""
     color = _tinted(s.params[:, BASE], _grime(s))
     for style, stone_m, joint, contrast in ((1, (0.8, 0.4), 0.035, 0.75), (2, (3.0, 1.5), 0.05, 0.3)):
-        own = np.nonzero(s.params[:, STYLE] == style)[0]
-        if len(own):
-            tone, joints = _masonry(rows_of(s, own), stone_m, joint, style)
-            color[own] = mix(_tinted(color[own], contrast * tone), color[own] * np.float32(0.5), joints)
+        of_style = np.nonzero(s.params[:, STYLE] == style)[0]
+        if len(of_style):
+            tone, joints = _masonry(rows_of(s, of_style), stone_m, joint, style)
+            color[of_style] = mix(
+                _tinted(color[of_style], contrast * tone), color[of_style] * np.float32(0.5), joints
+            )
     plinth = band(s.v, -50.0, 0.7, s.dv)
     color = mix(color, s.params[:, BASE] * np.float32(0.35) + np.float32(0.05), plinth * np.float32(0.8))
     cornice = band(s.v, s.params[:, TOP] + 0.05, s.params[:, TOP] + 0.3, s.dv)
@@ -320,16 +322,16 @@ def tag(s: TextureSamples) -> Float32Array:
     """Return ArUco or AprilTags about the origin of the coordinates, `PITCH` wide, on white boards."""
     white = np.ones(len(s.u), dtype=np.float32)
     for style, number in np.unique(s.params[:, [STYLE, SHIFT_U]], axis=0).astype(int):
-        own = np.nonzero((s.params[:, STYLE] == style) & (s.params[:, SHIFT_U] == number))[0]
+        of_tag = np.nonzero((s.params[:, STYLE] == style) & (s.params[:, SHIFT_U] == number))[0]
         modules = tag_modules(TAG_DICTIONARIES[style], int(number)).astype(np.float32)
-        part, count = rows_of(s, own), len(modules)
+        part, count = rows_of(s, of_tag), len(modules)
         edges = part.params[:, PITCH, None] * np.linspace(-0.5, 0.5, count + 1, dtype=np.float32)
         across, up = (
             band(x[:, None], edges[:, :-1], edges[:, 1:], width[:, None])
             for x, width in ((part.u, part.du), (part.v, part.dv))
         )
         beside = 1 - across.sum(axis=1) * up.sum(axis=1)
-        white[own] = beside + np.einsum("ni,ij,nj->n", up[:, ::-1], modules, across, optimize=True)
+        white[of_tag] = beside + np.einsum("ni,ij,nj->n", up[:, ::-1], modules, across, optimize=True)
     return np.repeat((np.float32(0.03) + np.float32(0.75) * white)[:, None], 3, axis=1)
 
 

@@ -66,8 +66,8 @@ def _chosen_sites(
     order = rng.permutation(len(sites))
     for kind, share in _SHARES.items():
         wanted = round(share * count)
-        own = [i for i in order if sites[i].kind == kind and rays[i] >= WANTED_RAYS]
-        chosen += _spaced(sites, own, chosen)[:wanted]
+        of_kind = [i for i in order if sites[i].kind == kind and rays[i] >= WANTED_RAYS]
+        chosen += _spaced(sites, of_kind, chosen)[:wanted]
     remaining = [i for i in order if i not in set(chosen) and rays[i] >= LEAST_RAYS]
     remaining.sort(key=lambda i: -min(int(rays[i]), WANTED_RAYS))
     return [sites[i] for i in sorted((chosen + _spaced(sites, remaining, chosen))[:count])]

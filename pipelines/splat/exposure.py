@@ -172,8 +172,8 @@ def with_vignetting(colour: Tensor, radius2: Tensor, coefficients: Tensor) -> Te
 
     `radius2` (H, W) is the squared distance from the optical axis; see `squared_radius`.
     """
-    shown: Tensor = colour * falloff(radius2, coefficients.unbind())[..., None]
-    return shown
+    vignetted: Tensor = colour * falloff(radius2, coefficients.unbind())[..., None]
+    return vignetted
 
 
 def falloff(radius2: _Values, coefficients: Sequence[_Values]) -> Any:

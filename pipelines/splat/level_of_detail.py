@@ -199,14 +199,14 @@ def best_cut(root: DetailTile, most: int) -> list[DetailTile]:
 
     The tile with the largest error is replaced by its children as long as there is room.
     """
-    shown, total = [root], root.count
+    cut, total = [root], root.count
     while True:
-        coarsest = max(shown, key=lambda tile: tile.error_m)
+        coarsest = max(cut, key=lambda tile: tile.error_m)
         total += sum(child.count for child in coarsest.children) - coarsest.count
         if total > most or not coarsest.children:
-            return shown
-        shown.remove(coarsest)
-        shown += coarsest.children
+            return cut
+        cut.remove(coarsest)
+        cut += coarsest.children
 
 
 def within_budget(root: DetailTile, most: int) -> DetailTile:

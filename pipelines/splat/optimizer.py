@@ -236,12 +236,12 @@ class GaussianAdam:
         return columns
 
     def _column_rates(self, iteration: int) -> Tensor:
-        own, columns = self.rates, self._columns()
+        base, columns = self.rates, self._columns()
         rates = self._exp_avg.new_empty(self._exp_avg.shape[1])
         for name in ("quats_wxyz", "log_scales", "logit_opacities"):
-            rates[columns[name]] = getattr(own, name)
-        rates[columns["sh"]] = own.sh_rest
-        rates[columns["sh"]][:3] = own.sh_dc
+            rates[columns[name]] = getattr(base, name)
+        rates[columns["sh"]] = base.sh_rest
+        rates[columns["sh"]][:3] = base.sh_dc
         progress = min(iteration / max(self.iterations, 1), 1.0)
         settling = _SETTLED ** (max(progress - _SETTLING_FROM, 0.0) / (1 - _SETTLING_FROM))
         rates *= self.rate_factor * settling
@@ -249,10 +249,10 @@ class GaussianAdam:
         return rates
 
     def _step_by_kernel(self, iteration: int, places: Tensor) -> None:
-        tensors, shown = self.gaussians.tensors().values(), self.shown.tensors().values()
+        tensors, visible = self.gaussians.tensors().values(), self.shown.tensors().values()
         parameters, gradients = (
             tuple(part.detach().contiguous().numpy().reshape(len(part), -1) for part in parts if part is not None)
-            for parts in (tensors, [tensor.grad for tensor in shown])
+            for parts in (tensors, [tensor.grad for tensor in visible])
         )
         rows = places if self._rows is None else self._rows[places]
         betas = np.array([_BETA1, 1 - _BETA1, _BETA2, 1 - _BETA2], dtype=np.float32)
@@ -275,11 +275,11 @@ class GaussianAdam:
 
         All quantities of a row are updated together: five times as few operations as one quantity after the other.
         """
-        tensors, shown, columns = self.gaussians.tensors(), self.shown.tensors(), self._columns()
+        tensors, visible, columns = self.gaussians.tensors(), self.shown.tensors(), self._columns()
         rows = places if self._rows is None else self._rows[places]
         self._steps[rows] += 1
         unbias = self._corrections[self._steps[rows].long().clamp_max(len(self._corrections) - 1)]
-        grads = [tensor.grad for tensor in shown.values()]
+        grads = [tensor.grad for tensor in visible.values()]
         parts = [grad[places].reshape(len(rows), -1) for grad in grads if grad is not None]
         gradient = torch.cat(parts, dim=1)
         average = self._exp_avg[rows].lerp_(gradient, 1 - _BETA1)

@@ -101,9 +101,9 @@ class SpatialBlocks:
             margin = WIDEST * math.sqrt(settings.dilation_px2) / focal
             slope = max(of_whole, whole - of_whole) / focal + FRUSTUM_MARGIN * 0.5 * whole / focal
             stretch = math.hypot(1.0, slope)  # of a σ on the screen
-            own = stretch * self._reach + margin * np.maximum(z + self._radius, 0.0)
-            ahead &= across - high * z <= math.hypot(1.0, high) * self._radius + own
-            ahead &= across - low * z >= -math.hypot(1.0, low) * self._radius - own
+            reach = stretch * self._reach + margin * np.maximum(z + self._radius, 0.0)
+            ahead &= across - high * z <= math.hypot(1.0, high) * self._radius + reach
+            ahead &= across - low * z >= -math.hypot(1.0, low) * self._radius - reach
         return np.flatnonzero(ahead)
 
 

@@ -51,11 +51,11 @@ def seen_surfels(surfels: Surfels, cam_from_world: FloatArray, center: FloatArra
     in_cam = (surfels.position - center) @ cam_from_world.T
     normal = surfels.normal @ cam_from_world.T
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    pixel, own = np.full(len(in_cam), -1, dtype=np.int64), np.zeros(len(in_cam))
+    pixel, depth_at_pixel = np.full(len(in_cam), -1, dtype=np.int64), np.zeros(len(in_cam))
     nearest = np.full(camera.width * camera.height, np.inf)
-    _draw(in_cam, normal, surfels.radius_m, intrinsics, camera.width, camera.height, nearest, pixel, own)
+    _draw(in_cam, normal, surfels.radius_m, intrinsics, camera.width, camera.height, nearest, pixel, depth_at_pixel)
     inside = np.flatnonzero(pixel >= 0)
-    rows = inside[own[inside] <= nearest[pixel[inside]] + surfels.radius_m[inside]]
+    rows = inside[depth_at_pixel[inside] <= nearest[pixel[inside]] + surfels.radius_m[inside]]
     row, column = np.divmod(pixel[rows], camera.width)
     return SeenSurfels(rows, row, column, in_cam[rows, 2])
 

@@ -187,8 +187,8 @@ def at_random(position: FloatArray) -> FloatArray:
 
 def spacing_of(points: TiledPoints, voxel_m: float) -> float:
     """Return the median distance between neighbours, one a voxel, in the square with the most points."""
-    rows, own = max((points.around(square, 0.0) for square in points.count), key=lambda part: len(part[0]))
-    place = rows["position"][own]
+    rows, inside = max((points.around(square, 0.0) for square in points.count), key=lambda part: len(part[0]))
+    place = rows["position"][inside]
     place = place[first_of_voxels(place, voxel_m)]
     chosen = np.random.default_rng(0).permutation(len(place))[:_SAMPLE]
     if len(place) < 2:

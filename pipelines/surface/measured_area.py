@@ -166,12 +166,12 @@ def measured_by(renderer: ModelRenderer, progress: Progress = SILENT) -> Measure
     places = cells.places()
     views = DepthViews.of(Viewpoints(rotation, center, pinholes), np.concatenate([depth.ravel() for depth in maps]))
     up_in_model = geo_from_model.rotation.T @ [0.0, 0.0, 1.0]
-    found = support(geo_from_model.inverse().apply(places), views, up_in_model, SAME_SURFACE)
-    found = found.scaled(geo_from_model.scale)
-    enough = (found.views >= LEAST_PHOTOGRAPHS) & (found.seen_through <= _MOST_THROUGH * found.views)
+    agreement = support(geo_from_model.inverse().apply(places), views, up_in_model, SAME_SURFACE)
+    agreement = agreement.scaled(geo_from_model.scale)
+    enough = (agreement.views >= LEAST_PHOTOGRAPHS) & (agreement.seen_through <= _MOST_THROUGH * agreement.views)
     with np.errstate(invalid="ignore", divide="ignore"):
-        lateral_m = _SIGMA_PX * pixel_m / (found.spread_rad * np.sqrt(found.views))
-        close = found.rms_up_m**2 + lateral_m**2 < (_RESOLVED_PX * training_m) ** 2
+        lateral_m = _SIGMA_PX * pixel_m / (agreement.spread_rad * np.sqrt(agreement.views))
+        close = agreement.rms_up_m**2 + lateral_m**2 < (_RESOLVED_PX * training_m) ** 2
     return MeasuredGround(cells.grid(enough & close), cells.corner, np.array([cells.cell_m, photo_m]))
 
 

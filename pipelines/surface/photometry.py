@@ -39,7 +39,7 @@ def mean_psnr(renderer: ModelRenderer, indices: Sequence[int], progress: Progres
     with progress.task("views compared", len(indices)) as task:
         for index in indices:
             photo, mask = photograph_and_mask(renderer, index)
-            shown = through_lens(renderer, index, renderer.render(index).colour.cpu()).clamp(0, 1)
-            figures.append(psnr(shown, photo, mask))
+            rendered = through_lens(renderer, index, renderer.render(index).colour.cpu()).clamp(0, 1)
+            figures.append(psnr(rendered, photo, mask))
             task.advance()
     return float(np.mean(figures)) if figures else None

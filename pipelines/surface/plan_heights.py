@@ -161,16 +161,16 @@ def _agreed(renderer: ModelRenderer, plan: FloatArray, height: FloatArray) -> Pl
     """Return the surface on which the views' heights (N, C) agree."""
     centers = renderer.geo_from_model.apply(renderer.poses.cam_center_in_model)
     middle_of_place = np.full(len(plan), np.nan)
-    left = np.isfinite(height)
+    used = np.isfinite(height)
     for _ in range(LEAST_VIEWS + 1):  # a single view that is higher than the others is left out, and the next taken
-        top = np.where(left, height, -np.inf)
+        top = np.where(used, height, -np.inf)
         highest = top.max(axis=1)
-        alike = left & (np.abs(height - highest[:, None]) < _tolerance(plan, height, centers))
-        through = (left & ~alike).sum(axis=1)
+        alike = used & (np.abs(height - highest[:, None]) < _tolerance(plan, height, centers))
+        through = (used & ~alike).sum(axis=1)
         good = (alike.sum(axis=1) >= LEAST_VIEWS) & (through <= MOST_THROUGH * alike.sum(axis=1))
         taken = good & np.isnan(middle_of_place)
         middle_of_place[taken] = np.nanmedian(np.where(alike, height, np.nan)[taken], axis=1)
-        left &= ~(alike & ~good[:, None])
+        used &= ~(alike & ~good[:, None])
     agree = np.isfinite(height) & (np.abs(height - middle_of_place[:, None]) < _tolerance(plan, height, centers))
     number = np.maximum(agree.sum(axis=1), 1)
     square = np.where(agree, (height - middle_of_place[:, None]) ** 2, 0.0).sum(axis=1) / number

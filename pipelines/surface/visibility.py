@@ -348,11 +348,11 @@ def seen_surface(
         for rotation, center, pinhole in zip(
             viewpoints.cam_from_world, viewpoints.center_in_world, viewpoints.pinholes, strict=True
         ):
-            shown = _in_view(blocks, rotation, center, pinhole)
-            depths.append(float(np.median(shown[:, 2])) if len(shown) else np.inf)
+            in_view = _in_view(blocks, rotation, center, pinhole)
+            depths.append(float(np.median(in_view[:, 2])) if len(in_view) else np.inf)
             # Never larger than the photograph, and one pixel if nothing is in view.
             shrink = float(np.clip(_CELL_VOXELS * voxel_m * pinhole.fx / depths[-1], 1, pinhole.width))
-            maps.append(_depth_map(shown, pinhole, shrink if len(shown) else float(pinhole.width)))
+            maps.append(_depth_map(in_view, pinhole, shrink if len(in_view) else float(pinhole.width)))
             task.advance()
     coarse = replace(viewpoints, pinholes=tuple(pinhole for pinhole, _ in maps))
     views = DepthViews.of(coarse, np.concatenate([depth.ravel() for _, depth in maps]))
@@ -374,13 +374,13 @@ def _in_view(
     return np.column_stack([xy, in_cam[:, 2]])[pinhole.contains(xy)]
 
 
-def _depth_map(shown: FloatArray, pinhole: Pinhole, shrink: float) -> tuple[Pinhole, Float32Array]:
+def _depth_map(in_view: FloatArray, pinhole: Pinhole, shrink: float) -> tuple[Pinhole, Float32Array]:
     """Return the least depth (H, W) of the points in and beside each pixel of an image `shrink` times smaller."""
     width, height = max(int(np.ceil(pinhole.width / shrink)), 1), max(int(np.ceil(pinhole.height / shrink)), 1)
     fx, fy, cx, cy = (value / shrink for value in (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy))
     depth, step = np.full((height, width), np.inf, dtype=np.float32), pinhole.fx / fx
-    column = np.minimum((shown[:, 0] / step).astype(np.int64), width - 1)
-    row = np.minimum((shown[:, 1] / step).astype(np.int64), height - 1)
-    np.minimum.at(depth, (row, column), shown[:, 2].astype(np.float32))
+    column = np.minimum((in_view[:, 0] / step).astype(np.int64), width - 1)
+    row = np.minimum((in_view[:, 1] / step).astype(np.int64), height - 1)
+    np.minimum.at(depth, (row, column), in_view[:, 2].astype(np.float32))
     nearest = minimum_filter(depth, size=3, mode="nearest")
     return Pinhole(width, height, fx, fy, cx, cy), np.where(np.isfinite(nearest), nearest, np.float32(0))

@@ -103,7 +103,7 @@ def _crs_text(layer: BoundaryLayer, stated: str | None, path: Path, crs_field: s
         return stated
     if not stated or not of_layer or _are_equal(stated, of_layer):
         return of_layer or stated or ""
-    shown = proj_crs(of_layer).name
+    name = proj_crs(of_layer).name
     if path.suffix.lower() in (".kml", ".kmz"):
         log.warning(
             "%s: %s is not used, KML is in WGS84.", path.name, crs_field, extra={"code": "boundary-crs-unused"}
@@ -112,7 +112,7 @@ def _crs_text(layer: BoundaryLayer, stated: str | None, path: Path, crs_field: s
     if not layer.crs_is_default:
         log.warning(
             "%s: %s, %s, overrules the file's CRS, %s.",
-            path.name, crs_field, stated, shown, extra={"code": "boundary-crs-overrules"},
+            path.name, crs_field, stated, name, extra={"code": "boundary-crs-overrules"},
         )  # fmt: skip
     return stated
 

@@ -408,11 +408,11 @@ def _sources(camera: Camera, pinhole: Pinhole, u: FloatArray, v: FloatArray) -> 
     full = distort(camera, ray)
     # Beyond its fold a lens polynomial leads back into the picture, to the pixel of another ray.
     with np.errstate(invalid="ignore"):
-        own = (np.abs(undistort(camera, full) - ray) < _SAME_RAY).all(axis=-1)
+        is_same_ray = (np.abs(undistort(camera, full) - ray) < _SAME_RAY).all(axis=-1)
     size = np.array([pinhole.width / camera.width, pinhole.height / camera.height])
     small = full * size
     limit = np.array([pinhole.width, pinhole.height]) - _EDGE_PX
-    inside = own & ((small >= _EDGE_PX) & (small <= limit)).all(axis=-1)
+    inside = is_same_ray & ((small >= _EDGE_PX) & (small <= limit)).all(axis=-1)
     # cv2 counts from the centre of the first pixel, and is slow to reflect pixels far outside.
     return np.clip(np.nan_to_num(small - 0.5), -limit, 2 * limit), inside
 

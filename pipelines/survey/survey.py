@@ -113,8 +113,8 @@ class Fix(Product):
 
     def scaled(self, factor: float) -> Fix:
         """Return the fix with its own variances times a factor; that of a doubtful zero stays."""
-        own = np.array(self.cov_apart) * factor
-        return self.model_copy(update={"cov_in_geo": _with_zero(own, self.sigma_zero_m**2)})
+        cov = np.array(self.cov_apart) * factor
+        return self.model_copy(update={"cov_in_geo": _with_zero(cov, self.sigma_zero_m**2)})
 
 
 def _with_zero(cov: ArrayLike, variance_up: float) -> Matrix3:
@@ -344,8 +344,8 @@ class Survey(Product):
         lost = next((image for image in everything if image.camera_id not in cameras), None)
         if lost is not None:
             raise ValueError(f"images: {lost.name} has camera {lost.camera_id}, which is not among the cameras")
-        shown = set(names["images"][: len(self.images)])
-        alone = next((each for each in self.companions if each.beside not in shown), None)
+        photographed = set(names["images"][: len(self.images)])
+        alone = next((each for each in self.companions if each.beside not in photographed), None)
         if alone is not None:
             raise ValueError(f"companions: {alone.name} is beside {alone.beside}, which is not among the images")
         fixed = [(image, image.fix) for image in self.images if self.sessions and image.fix is not None]

@@ -89,9 +89,9 @@ def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) 
     rows = max(1, round(_BACKGROUND_COLUMNS * camera.height / camera.width))
     in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
     xy = camera.project(in_cam)
-    shown = xy[camera.contains(xy)]
+    in_image = xy[camera.contains(xy)]
     occupied = np.zeros((rows + 2, _BACKGROUND_COLUMNS + 2), dtype=bool)
-    column, row = (shown * [_BACKGROUND_COLUMNS / camera.width, rows / camera.height]).astype(int).T
+    column, row = (in_image * [_BACKGROUND_COLUMNS / camera.width, rows / camera.height]).astype(int).T
     for shift_row in (0, 1, 2):
         for shift_column in (0, 1, 2):
             occupied[row + shift_row, column + shift_column] = True
@@ -231,11 +231,11 @@ def hidden(points: FloatArray, scene: Scene, maps: DepthMaps) -> BoolArray:
         camera = maps.camera(index)
         in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
         xy = camera.project(in_cam)
-        shown = np.flatnonzero(camera.contains(xy))
-        column, row = xy[shown].astype(np.int64).T
+        in_image = np.flatnonzero(camera.contains(xy))
+        column, row = xy[in_image].astype(np.int64).T
         depth = maps.depth(index)[row, column]
-        facing[shown] += 1
-        behind[shown] += (depth > 0) & (depth < in_cam[shown, 2])
+        facing[in_image] += 1
+        behind[in_image] += (depth > 0) & (depth < in_cam[in_image, 2])
     return np.asarray(behind >= _HIDDEN_SHARE * facing)
 
 
@@ -370,14 +370,14 @@ def depth_loss_points(training: TrainingScene, device: torch.device) -> Callable
     These are SfM points and, in training images, points of the surface.
     """
     scene = training.scene
-    shown = set(map(int, scene.train))
+    training_views = set(map(int, scene.train))
 
     @lru_cache(maxsize=_KEPT_VIEWS)
     def points(index: int) -> ObservedPoints:
         seen = np.unique(scene.sparse.obs_point[scene.sparse.obs_image == index])
         known = scene.point_in_model[seen]
         weight = np.ones(len(known), dtype=np.float32)
-        if training.surface is not None and index in shown:
+        if training.surface is not None and index in training_views:
             of_surface, its_weight = training.surface.depth_loss_points(index, _STRIDE)
             known, weight = np.concatenate([known, of_surface]), np.concatenate([weight, its_weight])
         inside = training.in_region(known)

@@ -155,9 +155,9 @@ def compared_lidar(
         files, maps.scene, survey, pixel_m, progress=progress, track=track, held_out=options.lidar_held_out
     )
     surface_in_model = np.concatenate([surface.points(index, _STRIDE) for index in map(int, maps.scene.train)])
-    found = registration_of(cloud, surface_in_model, views, seed, depths=isinstance(files, PhotoDepths))
-    record = _checked(found, cloud, maps.scene, georeference, options)
-    return ComparedLidar(cloud, held, maps, views, surface_in_model, pixel_m, found, record)
+    registered = registration_of(cloud, surface_in_model, views, seed, depths=isinstance(files, PhotoDepths))
+    record = _checked(registered, cloud, maps.scene, georeference, options)
+    return ComparedLidar(cloud, held, maps, views, surface_in_model, pixel_m, registered, record)
 
 
 def lidar_surface(
@@ -251,15 +251,15 @@ def registration_of(
         ) from error
 
 
-def plane_observations(found: Registration, geo_from_model: Similarity) -> Planes:
+def plane_observations(registered: Registration, geo_from_model: Similarity) -> Planes:
     """Return one plane for each cluster of 5 m and each direction that planes face there.
 
     The errors of neighbouring points are not independent: the median of a cluster is one observation. Its σ is the
     robust spread of these medians about the shift of the registration, which is part of the observations again. The
     initial similarity is a pure shift.
     """
-    matches = found.matches
-    distance = matches.distance_m - found.wall_bias_m * matches.wall
+    matches = registered.matches
+    distance = matches.distance_m - registered.wall_bias_m * matches.wall
     facing = np.abs(matches.normal_in_model).argmax(axis=1)
     side = np.sign(np.take_along_axis(matches.normal_in_model, facing[:, None], axis=1))[:, 0]
     cell = np.floor(matches.point_in_model / _CLUSTER_M).astype(np.int64)
@@ -273,7 +273,7 @@ def plane_observations(found: Registration, geo_from_model: Similarity) -> Plane
     sigma_m = max(mad_sigma(off), _LEAST_SIGMA_M)
     return Planes(
         point_in_model=measured + off[:, None] * normal,
-        position_in_geo=geo_from_model.apply(measured + found.shift_m),
+        position_in_geo=geo_from_model.apply(measured + registered.shift_m),
         normal_in_geo=normal,
         cov=np.full((len(middle), 1, 1), sigma_m**2),
     )

@@ -59,10 +59,10 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
         InputError: the checkpoint cannot be read.
     """
     loop, iterations = _Loop(trainer, options), trainer.options.iterations
-    shown, time_left = trainer.iteration, TimeLeft(trainer.work, iterations)
+    reported, time_left = trainer.iteration, TimeLeft(trainer.work, iterations)
     worked, since = math.nan, iterations  # the first iteration is no measure of the others: it loads kernels
     with deferred_interrupts() as stop, progress.task("training", iterations) as task:
-        task.advance(shown)
+        task.advance(reported)
         while trainer.iteration < iterations:
             try:
                 row = loop.iterate()
@@ -71,8 +71,8 @@ def optimise(trainer: JointTrainer, options: LoopOptions, progress: Progress) ->
                     time_left.start(since)
                 if row is not None:
                     note = f"{row['psnr']:.1f} dB, {row['gaussians'] / 1000:.0f} k Gaussians"
-                    task.advance(max(trainer.iteration - shown, 0), note, time_left.after(trainer.iteration))
-                    shown = max(trainer.iteration, shown)
+                    task.advance(max(trainer.iteration - reported, 0), note, time_left.after(trainer.iteration))
+                    reported = max(trainer.iteration, reported)
                 if stop.requested:
                     loop.save()
                     log.warning(

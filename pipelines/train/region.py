@@ -136,8 +136,8 @@ def region_mask(
     size = pinhole.width, pinhole.height
     depth = cv2.resize(np.array(stand_in), size, interpolation=cv2.INTER_NEAREST)
     if known is not None:
-        own = cv2.resize(np.array(known), size, interpolation=cv2.INTER_NEAREST)
-        depth = np.where(own > 0, own, depth)
+        known_depth = cv2.resize(np.array(known), size, interpolation=cv2.INTER_NEAREST)
+        depth = np.where(known_depth > 0, known_depth, depth)
     mask, rows = np.empty(depth.shape, dtype=bool), max(1, _BAND_PX // pinhole.width)
     for top in range(0, pinhole.height, rows):
         band = Window(0, top, pinhole.width, min(rows, pinhole.height - top))

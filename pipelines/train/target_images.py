@@ -168,12 +168,12 @@ class TargetImages:
     def _find_part(self, look: ImageLook) -> ImagePart:
         camera = shrunken(self._images.pinhole(look.index), look.shrink)
         image = Window(0, 0, camera.width, camera.height)
-        shown = None if self._region is None else self._region.view(look.index, look.shrink)
-        trained = image if shown is None else shown.window
-        count = 0 if shown is None else int(shown.mask.sum())
-        share = 1.0 if shown is None else count / (camera.width * camera.height)
+        part_of_region = None if self._region is None else self._region.view(look.index, look.shrink)
+        trained = image if part_of_region is None else part_of_region.window
+        count = 0 if part_of_region is None else int(part_of_region.mask.sum())
+        share = 1.0 if part_of_region is None else count / (camera.width * camera.height)
         if self._crops is None or look.visit is None or self._crops.count(trained.width, trained.height) == 1:
-            return ImagePart(None if shown is None else trained, share=share)
+            return ImagePart(None if part_of_region is None else trained, share=share)
         turn, place = divmod(look.visit, self._crops.count(trained.width, trained.height))
         crops = self._crops.of(look.index, trained, turn)
         counts = [self._count(look, window) for window in crops]
@@ -210,9 +210,9 @@ class TargetImages:
         mask = np.asarray(blocks.all(axis=(1, 3)), dtype=bool)
         if self._region is None:
             return mask
-        shown = self._region.view(look.index, s)
-        top, left = window.top - shown.window.top, window.left - shown.window.left
-        return np.asarray(mask & shown.mask[top : top + window.height, left : left + window.width])
+        region = self._region.view(look.index, s)
+        top, left = window.top - region.window.top, window.left - region.window.left
+        return np.asarray(mask & region.mask[top : top + window.height, left : left + window.width])
 
     def _read(self, look: ImageLook) -> Tensor:
         image, window = self._images.image(look.index, look.shrink), self._part(look).window

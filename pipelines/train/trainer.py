@@ -220,8 +220,8 @@ class JointTrainer:
         normal = self.schedule.weight_of_normals(self.iteration) > 0
         settings, optimizer = self._settings(target, depth=depth, normal=normal), self.optimizer
         rows = self.rasterizer.candidates(optimizer.gaussians, pose, target.whole, settings)
-        shown = optimizer.show(rows)
-        render = self._render(shown, pose, target, settings)
+        visible = optimizer.show(rows)
+        render = self._render(visible, pose, target, settings)
         colour, counting = self._exposed(index, render.colour, target), target.mask
         if self.outliers is not None:
             longest_px = max(target.whole.width, target.whole.height)
@@ -232,7 +232,7 @@ class JointTrainer:
             index,
             pose,
             target,
-            shown,
+            visible,
             rows,
             count,
             render,

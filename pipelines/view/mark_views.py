@@ -39,9 +39,9 @@ def epipolar_lines(
         in_cam = (along - poses.cam_center_in_model[camera]) @ poses.cam_from_model[camera].T
         pixel = project(lens, in_cam)
         beside = np.array([lens.width, lens.height])
-        shown = np.isfinite(pixel).all(axis=1) & ((pixel > -beside) & (pixel < 2 * beside)).all(axis=1)
-        if shown.sum() > 1:
-            lines.append((sparse.image_name[other], pixel[shown]))
+        in_image = np.isfinite(pixel).all(axis=1) & ((pixel > -beside) & (pixel < 2 * beside)).all(axis=1)
+        if in_image.sum() > 1:
+            lines.append((sparse.image_name[other], pixel[in_image]))
     return lines
 
 

@@ -83,7 +83,7 @@ def residuals_px(point_in_geo: FloatArray, rays: MarkRays, solution: Solution) -
 def appears_in(point_in_geo: FloatArray, solution: Solution, sparse: SparseModel) -> list[tuple[int, FloatArray]]:
     """Return the cameras whose photograph must show a point (3,), the nearest first, with its pixel (2,) there."""
     place, poses = solution.similarity.inverse().apply(point_in_geo[None])[0], solution.poses
-    shown = []
+    views = []
     for camera in range(len(sparse.image_name)):
         in_cam = poses.cam_from_model[camera] @ (place - poses.cam_center_in_model[camera])
         lens = sparse.camera_of(camera)
@@ -91,8 +91,8 @@ def appears_in(point_in_geo: FloatArray, solution: Solution, sparse: SparseModel
             continue
         pixel = project(lens, in_cam[None])[0]
         if np.isfinite(pixel).all() and (pixel >= 0).all() and (pixel <= [lens.width, lens.height]).all():
-            shown.append((float(np.linalg.norm(in_cam)), camera, pixel))
-    return [(camera, pixel) for _, camera, pixel in sorted(shown, key=lambda each: each[0])]
+            views.append((float(np.linalg.norm(in_cam)), camera, pixel))
+    return [(camera, pixel) for _, camera, pixel in sorted(views, key=lambda each: each[0])]
 
 
 def mark_texts(crs: str, points: Sequence[MarkedPoint]) -> dict[str, str]:

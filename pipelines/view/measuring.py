@@ -209,24 +209,24 @@ class MeasuringModel:
         grid = quantities.grid_in_polygon(joint.position_in_geo[:, :2], spacing)
         if not len(grid):
             return None
-        found = heights_in_plan(
+        heights = heights_in_plan(
             self.reader.renderer, grid, float(np.median(joint.position_in_geo[:, 2])), spacing / np.sqrt(2),
             most_views=fineness.views, advance=fineness.advance,
         )  # fmt: skip
-        rows = np.flatnonzero(found.known)
+        rows = np.flatnonzero(heights.known)
         if not len(rows):
             return None
-        samples = np.column_stack([grid[rows], found.height_m[rows]])
+        samples = np.column_stack([grid[rows], heights.height_m[rows]])
         chosen = np.unique(np.linspace(0, len(rows) - 1, _JOINT_SAMPLES).astype(np.int64))
         shared = self._joint_covariance(
             [*(point.position_in_geo for point in corners), *samples[chosen]],
-            [*(point.cameras for point in corners), *cameras_of(found, rows[chosen])],
+            [*(point.cameras for point in corners), *cameras_of(heights, rows[chosen])],
         )
         if shared is not None:
-            own = [point.cov_of_surface for point in corners]
-            shared = shared + block_diag(*own, *[np.zeros((3, 3))] * len(chosen))
+            cov_of_corners = [point.cov_of_surface for point in corners]
+            shared = shared + block_diag(*cov_of_corners, *[np.zeros((3, 3))] * len(chosen))
         surface = quantities.SampledSurface(
-            corners=joint, samples=samples, sigma_up_m=found.sigma_m[rows], cov_in_geo=shared, chosen=chosen,
+            corners=joint, samples=samples, sigma_up_m=heights.sigma_m[rows], cov_in_geo=shared, chosen=chosen,
             pixel_m=pixel_m,
         )  # fmt: skip
         share = 100 * (len(rows) / len(grid))

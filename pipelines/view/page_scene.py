@@ -152,7 +152,7 @@ def drawn_contours(workspace: Workspace, survey: Survey, frame: ViewFrame) -> li
     path = workspace.root / _CONTOURS
     if not path.is_file():
         return []
-    found, places = [], 0
+    contours, places = [], 0
     try:
         wkt, lines = read_contours(path)
         crs = _crs(wkt, survey, frame)
@@ -164,8 +164,8 @@ def drawn_contours(workspace: Workspace, survey: Survey, frame: ViewFrame) -> li
             break
         in_geo = crs.geo_from_xyz(np.column_stack([line.xy, np.full(len(line.xy), line.height)]))
         at = np.round(frame.from_geo(in_geo), 2).tolist()
-        found.append({"height": line.height, "major": line.is_major, "at": at})
-    return found
+        contours.append({"height": line.height, "major": line.is_major, "at": at})
+    return contours
 
 
 def changed_regions(workspace: Workspace, survey: Survey, frame: ViewFrame) -> list[Json]:

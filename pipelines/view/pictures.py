@@ -266,9 +266,9 @@ class Painter:
         height, width = rgb.shape[:2]
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
         turn = self._renderer.poses.cam_from_model[camera] @ pose.cam_from_model.T
-        own = pose.pinhole.rays(pixels) @ turn.T
-        ahead = own[..., 2] > 0
-        slope = own[..., :2] / np.where(ahead, own[..., 2], 1.0)[..., None]
+        ray = pose.pinhole.rays(pixels) @ turn.T
+        ahead = ray[..., 2] > 0
+        slope = ray[..., :2] / np.where(ahead, ray[..., 2], 1.0)[..., None]
         lens = self._renderer.sparse.camera_of(camera)
         place = np.asarray(distort(lens, slope)) - 0.5
         # Beyond its fold a lens polynomial leads back into the picture, to the pixel of another ray.

@@ -100,8 +100,8 @@ def proposed_marks(
         )
     places = {}  # where points are expected (3,) in `geo`
     for point in points:
-        own = {mark.image: (mark.x_px, mark.y_px) for mark in point.marks}
-        by_marks = triangulated_points(solution, rays_of(MarkedPoint(point.name, None, marks=own), sparse))[0]
+        pixels = {mark.image: (mark.x_px, mark.y_px) for mark in point.marks}
+        by_marks = triangulated_points(solution, rays_of(MarkedPoint(point.name, None, marks=pixels), sparse))[0]
         places[point.name] = by_marks if np.isfinite(by_marks).all() else np.array(point.position_in_geo)
     proposed: list[ProposedMark] = []
     wanted: dict[int, list[tuple[str, FloatArray]]] = defaultdict(list)

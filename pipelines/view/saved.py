@@ -187,6 +187,6 @@ def _feature(measurement: NamedMeasurement) -> Json:
     values = {quantity.name: quantity.value for quantity in measurement.quantities}
     sigmas = {f"sigma of {quantity.name}": quantity.sigma for quantity in measurement.quantities}
     names = {"name": measurement.name, "kind": measurement.kind}  # which no quantity replaces
-    own = {**names, **values, **sigmas, **names}
+    properties = {**names, **values, **sigmas, **names}
     geometry = None if shape is None else shapely.geometry.mapping(shape)
-    return feature(geometry, {**own, "georef": measurement.model_dump(mode="json")})
+    return feature(geometry, {**properties, "georef": measurement.model_dump(mode="json")})

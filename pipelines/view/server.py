@@ -105,14 +105,14 @@ class ViewerServer:
 
     def refuses_strangers(self) -> bool:
         """Return whether another host, a page from elsewhere and an address without the key are refused."""
-        own, page = f"{HOST}:{self.port}", f"/{self.key}/"
+        host, page = f"{HOST}:{self.port}", f"/{self.key}/"
         strangers = (
             (page, {"Host": _FOREIGN}),
-            (page, {"Host": own, "Origin": f"http://{_FOREIGN}"}),
-            ("/", {"Host": own}),
+            (page, {"Host": host, "Origin": f"http://{_FOREIGN}"}),
+            ("/", {"Host": host}),
         )
         refused = all(_status(self.port, path, headers) == HTTPStatus.FORBIDDEN for path, headers in strangers)
-        return refused and _status(self.port, page, {"Host": own}) == HTTPStatus.OK
+        return refused and _status(self.port, page, {"Host": host}) == HTTPStatus.OK
 
 
 def _bound(port: int) -> tuple[list[Any], int]:
@@ -149,11 +149,11 @@ class _Handler(RequestHandler):
 
     def prepare(self) -> None:
         hosts, origins = (self.request.headers.get_list(name) for name in ("Host", "Origin"))
-        own = {f"{name}:{self._server.port}" for name in (HOST, "localhost")}
+        allowed = {f"{name}:{self._server.port}" for name in (HOST, "localhost")}
         given, slash, self._path = self.request.path.removeprefix("/").partition("/")
         if not (
             len(hosts) == 1
-            and hosts[0] in own
+            and hosts[0] in allowed
             and all(origin == f"http://{hosts[0]}" for origin in origins)
             and slash
             and hmac.compare_digest(given.encode(errors="replace"), self._server.key.encode())

@@ -127,8 +127,10 @@ class Viewer:
             gsd_m = away_m / lens.mean_focal_px
             rim = float(np.min(np.minimum(pixel, size - pixel) / size))
             down_deg = float(np.degrees(np.arccos(np.clip(away[2] / away_m, -1, 1))))
-            own = {"camera": camera, "image": self.name_of(camera), "px": pixel.tolist(), "gsd_m": gsd_m}
-            photographs.append((gsd_m * (2.0 if rim < _PIXEL_MARGIN else 1.0), {**own, "angle_deg": down_deg}))
+            described = {"camera": camera, "image": self.name_of(camera), "px": pixel.tolist(), "gsd_m": gsd_m}
+            photographs.append(
+                (gsd_m * (2.0 if rim < _PIXEL_MARGIN else 1.0), {**described, "angle_deg": down_deg})
+            )
         return [each for _, each in sorted(photographs, key=lambda each: each[0])[:_MOST_SEEN]]
 
     def name_of(self, camera: int) -> str:
@@ -367,9 +369,9 @@ class Viewer:
         point = self._point(name)
         place = self.expected(point)
         if place is None:
-            shown: list[tuple[int, Any]] = [(camera, None) for camera in range(len(self.sparse.image_name))]
+            views: list[tuple[int, Any]] = [(camera, None) for camera in range(len(self.sparse.image_name))]
         else:
-            shown = [(camera, pixel.tolist()) for camera, pixel in appears_in(place, self.solution, self.sparse)]
+            views = [(camera, pixel.tolist()) for camera, pixel in appears_in(place, self.solution, self.sparse)]
         return [
             {
                 "camera": camera,
@@ -378,7 +380,7 @@ class Viewer:
                 "mark": point.marks.get(self.name_of(camera)),
                 "size": [self.sparse.camera_of(camera).width, self.sparse.camera_of(camera).height],
             }
-            for camera, pixel in shown
+            for camera, pixel in views
         ]
 
     def lines(self, name: str, camera: int) -> list[Json]:

@@ -165,11 +165,11 @@ def labelled(pictures: Sequence[ByteArray], labels: Sequence[str]) -> ByteArray:
     )
     most = max(int(width / (_LETTER_WIDTH * letters_px)), 1)
     for index, text in enumerate(labels):
-        shown = text if len(text) <= most else f"…{text[len(text) - most + 1 :]}"
+        label = text if len(text) <= most else f"…{text[len(text) - most + 1 :]}"
         figure.text(
             (index + 0.5) / len(labels),
             0.5,
-            shown,
+            label,
             ha="center",
             va="center",
             color=look.DARK,

@@ -43,11 +43,11 @@ class Parts:
         whole = Workspace(self.workspace.root / FOLDER, self.workspace, lent, FOLDER)
         if number is None:
             return whole
-        own = {
+        of_block = {
             spec.folder: whole.root / spec.folder
             for spec in (stages.PLAN_BLOCKS, stages.SOLVE, stages.TRAIN_SCAFFOLD)
         }
-        return Workspace(whole.root / str(number), self.workspace, lent | own, FOLDER)
+        return Workspace(whole.root / str(number), self.workspace, lent | of_block, FOLDER)
 
     def on_gpu(self) -> bool:
         """Return whether a block takes a GPU; a backend that is not available here is an error."""

@@ -288,8 +288,8 @@ class _Planner:
             reach = 1.2 * np.array([pinhole.width / pinhole.fx, pinhole.height / pinhole.fy])
             ahead = ahead[(slope < reach).all(axis=1)]
             xy = project(camera, in_cam[ahead])
-            shown = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=1)
-            seen.append(float(surface[ahead[shown]].sum()))
+            in_image = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=1)
+            seen.append(float(surface[ahead[in_image]].sum()))
         return self.options.max_gaussians * float(np.mean(seen)) if seen else 0.0
 
     def _gaussians(self, inside: BoolArray) -> int:

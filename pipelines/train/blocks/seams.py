@@ -119,11 +119,11 @@ class _SeamTrainer:
         parts = {number: read_gaussians(_file(self.folder, number)) for number in near}
         together = Gaussians.concatenate(list(parts.values()))
         means = together.means.double().numpy()
-        own = strip.contains(means)
-        frozen = together.select(torch.from_numpy(around.contains(means) & ~own))
+        in_strip = strip.contains(means)
+        frozen = together.select(torch.from_numpy(around.contains(means) & ~in_strip))
         beyond = torch.from_numpy(~around.contains(self.scaffold.means.double().numpy()))
         surroundings = Gaussians.concatenate([frozen, self.scaffold.select(beyond)])
-        rows = torch.from_numpy(own)
+        rows = torch.from_numpy(in_strip)
         cameras = sorted({*first.cameras, *second.cameras})
         trained = self._trained(cameras, strip, together.select(rows), surroundings)
         if trained is None:
@@ -132,7 +132,7 @@ class _SeamTrainer:
             values[rows] = trained.tensors()[name]
         ends = np.cumsum([len(part) for part in parts.values()])
         for (number, part), end in zip(parts.items(), ends.tolist(), strict=True):
-            if own[end - len(part) : end].any():
+            if in_strip[end - len(part) : end].any():
                 changed = together.select(torch.arange(end - len(part), end))
                 write_gaussians(_file(self.folder, number), changed)
 

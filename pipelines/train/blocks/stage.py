@@ -181,9 +181,11 @@ class SeamViews:
         depths, colours, views = [], [], 0
         common = sorted(set(first.cameras) & set(second.cameras))
         common = common[:: max(1, len(common) // _CANDIDATES)]
-        shown = {name: int(self._view(first, name, _CANDIDATE_PX, (first, second)).shared.sum()) for name in common}
-        for name in sorted(common, key=lambda name: -shown[name])[:_VIEWS]:
-            if not shown[name]:
+        shared_px = {
+            name: int(self._view(first, name, _CANDIDATE_PX, (first, second)).shared.sum()) for name in common
+        }
+        for name in sorted(common, key=lambda name: -shared_px[name])[:_VIEWS]:
+            if not shared_px[name]:
                 break
             one, other = (self._view(block, name, _IMAGE_PX, (first, second)) for block in (first, second))
             both = one.shared & other.shared
@@ -220,9 +222,9 @@ class SeamViews:
 
     def _model_of(self, number: int) -> Gaussians:
         """Return the Gaussians of a block, with the scaffold's outside of its region, on the device."""
-        own = read_gaussians(self._parts.variant(number).path(stages.BLOCK_GAUSSIANS))
+        block = read_gaussians(self._parts.variant(number).path(stages.BLOCK_GAUSSIANS))
         around = ~self._plan.block(number).region.contains(self._scaffold.means.double().numpy())
-        return Gaussians.concatenate([own, self._scaffold.select(torch.from_numpy(around))]).to(self._device)
+        return Gaussians.concatenate([block, self._scaffold.select(torch.from_numpy(around))]).to(self._device)
 
 
 def merge_blocks(parts: Parts, plan: BlockPlan, folder: Path, progress: Progress) -> Summary:
