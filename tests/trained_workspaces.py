@@ -23,7 +23,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.initialise import gaussians_of_size
 from pipelines.survey.navigation import load_survey
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.survey.solution import Solution, TrainedModel, read_solution
 from tests.once import fill_folder
 from tests.scenes import (
@@ -73,10 +73,10 @@ def _write_trained(scene: TrueScene, root: Path) -> None:
     write_adjustment(workspace)
 
 
-def scene_of(model: Solution, sfm: SparseModel) -> Scene:
+def scene_of(model: Solution, sfm: SparseModel) -> SparseScene:
     """Return the scene that a solution belongs to."""
     every = np.arange(len(sfm.image_name))
-    return Scene(sfm, Similarity.from_record(model.model_from_local), model.similarity, every, every[:0])
+    return SparseScene(sfm, Similarity.from_record(model.model_from_local), model.similarity, every, every[:0])
 
 
 def write_adjustment(workspace: Workspace) -> None:

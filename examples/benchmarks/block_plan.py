@@ -15,7 +15,7 @@ from pipelines.core.machine import peak_memory_bytes
 from pipelines.geometry.cameras import Camera, project
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.train.blocks.plan import plan_blocks
 from pipelines.train.options import PlanOptions
 
@@ -24,7 +24,7 @@ _HEIGHT_M, _ALONG_M, _ACROSS_M = 100.0, 21.0, 43.0
 _DOWN = np.diag([1.0, -1.0, -1.0])
 
 
-def made_up_scene(photographs: int, points_in_view: int) -> Scene:
+def made_up_scene(photographs: int, points_in_view: int) -> SparseScene:
     """Return a survey whose frames `local` and `model` are one."""
     rng = np.random.default_rng(0)
     rows = round(np.sqrt(photographs * _ALONG_M / _ACROSS_M))
@@ -64,7 +64,7 @@ def made_up_scene(photographs: int, points_in_view: int) -> Scene:
         obs_xy_px=np.concatenate(pixels)[order],
     )
     everyone = np.arange(photographs)
-    return Scene(sparse, Similarity(), Similarity(), everyone, everyone[:0])
+    return SparseScene(sparse, Similarity(), Similarity(), everyone, everyone[:0])
 
 
 def main() -> None:

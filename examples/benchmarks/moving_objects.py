@@ -21,7 +21,7 @@ from pipelines.core.types import BoolArray, ByteArray
 from pipelines.core.workspace import Workspace
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.survey.photographs import ImageCache, save_array
-from pipelines.survey.scene import Scene, load_adjusted_scene
+from pipelines.survey.scene import SparseScene, load_adjusted_scene
 from pipelines.train.options import TrainOptions
 from pipelines.train.trainer import JointTrainer
 
@@ -36,7 +36,7 @@ def discs(shape: tuple[int, int], count: int, share: float, random: np.random.Ge
 
 
 def paint(
-    scene: Scene, images: ImageCache, arguments: argparse.Namespace, *, write: bool
+    scene: SparseScene, images: ImageCache, arguments: argparse.Namespace, *, write: bool
 ) -> dict[int, tuple[BoolArray, ByteArray]]:
     """Paint the undistorted training photographs, if `write`; returns mask and clean photograph of each."""
     random, painted = np.random.default_rng(arguments.seed), {}

@@ -16,7 +16,7 @@ from pipelines.jobs.costs import MEASURED_CORES
 from pipelines.sfm.estimate import estimated_cost
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.block_plan import BlockPlan
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.train.blocks.plan import plan_blocks
 from pipelines.train.estimate import block_processor_s, training_pinhole, with_effort
 from pipelines.train.options import PlanOptions, Preset, TrainOptions
@@ -57,7 +57,7 @@ COLUMNS = {
 }
 
 
-def plan_of(scene: Scene, machines: Machines, effort: Preset) -> BlockPlan:
+def plan_of(scene: SparseScene, machines: Machines, effort: Preset) -> BlockPlan:
     """Return as many blocks as the memory of a worker demands, and at least one for each worker."""
     options = PlanOptions(
         block_memory=machines.memory_gib,
@@ -71,7 +71,7 @@ def plan_of(scene: Scene, machines: Machines, effort: Preset) -> BlockPlan:
     return plan_blocks(scene, options.model_copy(update={"blocks": machines.workers, "block_memory": None}))
 
 
-def projected(count: int, scene: Scene, name: str) -> list[str]:
+def projected(count: int, scene: SparseScene, name: str) -> list[str]:
     """Return the steps of a survey on some machines: times, and the number and memory of the blocks."""
     machines, measured = COLUMNS[name], MEASURED.get((count, name), {})
     reconstruction = estimated_cost(count, PHOTO_PX, SfmOptions())

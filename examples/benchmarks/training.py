@@ -47,7 +47,7 @@ from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.surface_views import ModelRenderer
 from pipelines.survey.marks import mark_rays, triangulated_points
 from pipelines.survey.photographs import ImageCache
-from pipelines.survey.scene import Scene, load_adjusted_scene, photographs
+from pipelines.survey.scene import SparseScene, load_adjusted_scene, photographs
 from pipelines.survey.solution import GeolocatedPoints
 from pipelines.survey.survey import Survey
 from pipelines.train.georeference.problem import frozen_problem, refining_problem
@@ -106,14 +106,14 @@ def scaling(arguments: argparse.Namespace) -> None:
         print(f"{name}: {np.round(cost, 4).tolist()}, {ratio.min():.2f} to {ratio.max():.2f} of each")
 
 
-def undistorted(root: Path, scene: Scene, survey: Survey, options: TrainOptions) -> ImageCache:
+def undistorted(root: Path, scene: SparseScene, survey: Survey, options: TrainOptions) -> ImageCache:
     """Undistorted photographs of a workspace with init-sim3 done."""
     images = photographs(scene.sparse, survey, Workspace(root), options.effort.max_image_size)
     images.build()
     return images
 
 
-def trainer_on(root: Path, options: TrainOptions) -> tuple[JointTrainer, Scene, ImageCache]:
+def trainer_on(root: Path, options: TrainOptions) -> tuple[JointTrainer, SparseScene, ImageCache]:
     """Trainer before its first iteration, on a workspace with init-sim3 done, as `georef train` makes it."""
     solution, survey, scene = load_adjusted_scene(Workspace(root))
     images = undistorted(root, scene, survey, options)
@@ -165,7 +165,7 @@ def curve(arguments: argparse.Namespace) -> None:
                 )
 
 
-def psnr_of_test_views(trainer: JointTrainer, scene: Scene, images: ImageCache) -> float:
+def psnr_of_test_views(trainer: JointTrainer, scene: SparseScene, images: ImageCache) -> float:
     """Mean over the test views of the renders as they are, without exposure."""
     return ViewQuality(trainer, images).psnr(scene.test)
 

@@ -42,7 +42,7 @@ from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import median_spacing, outlier_gate, typical_sigma
 from pipelines.survey.measurement_errors import EstimatedError, Group, VarianceFactor
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.survey.survey import Survey
 
 Factors = Mapping[Group, VarianceFactor]
@@ -103,7 +103,7 @@ class _Finding:
 
 def cautions_of(
     survey: Survey,
-    scene: Scene,
+    scene: SparseScene,
     near: Linearised,
     consistency: Consistency,
     pattern: FixPattern | None = None,

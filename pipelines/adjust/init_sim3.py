@@ -67,7 +67,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import ResidualStats, residual_stats, squared_mahalanobis
 from pipelines.survey.marks import of_wrong_marks, wrong_marks
 from pipelines.survey.navigation import load_survey
-from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.scene import SparseScene, initial_scene
 from pipelines.survey.solution import GeolocatedPoints, MeasurementVerdict, SimilarityEstimate, Solution
 from pipelines.survey.survey import MountParameter, Survey
 
@@ -266,7 +266,7 @@ def solved(
     verdict: MeasurementVerdict | None = None,
     *,
     estimate: tuple[MountParameter, ...] = (),
-    joint: tuple[Scene, Linearised] | None = None,
+    joint: tuple[SparseScene, Linearised] | None = None,
 ) -> Posterior:
     """Return the solution of a joint adjustment without the measurements that it has rejected.
 
@@ -391,7 +391,7 @@ def _of_unused(unused: tuple[UnusedControlPoint, ...]) -> tuple[Remark, ...]:
 def _joint_product(
     points: GeolocatedPoints,
     before: tuple[SimilarityEstimate, MeasurementVerdict],
-    scene: Scene,
+    scene: SparseScene,
     near: Linearised,
     consistency: Consistency,
 ) -> tuple[SimilarityEstimate, MeasurementVerdict, tuple[Remark, ...]]:

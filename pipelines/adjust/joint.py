@@ -38,7 +38,7 @@ from pipelines.survey.measurement_errors import (
     applied_factors,
     with_variance_factors,
 )
-from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.scene import SparseScene, initial_scene
 from pipelines.survey.solution import SimilarityEstimate
 from pipelines.survey.survey import MountParameter, Survey
 
@@ -96,7 +96,7 @@ class Start:
 
 def adjust_jointly(
     survey: Survey, model: SparseModel, starts: Iterable[Start], *, estimate: tuple[MountParameter, ...] = ()
-) -> tuple[Scene, Linearised, Consistency]:
+) -> tuple[SparseScene, Linearised, Consistency]:
     """Return the minimum from the first start, or the likeliest of several where the first finds disagreement.
 
     The scene is that of the start. The problem at its minimum has all measurements, with the variance factors. A
@@ -108,7 +108,7 @@ def adjust_jointly(
     """
     attempts: list[_Found] = []
     refusal = DegenerateGeometryError("no-start", "The joint adjustment has no start.")
-    frame: Scene | None = None
+    frame: SparseScene | None = None
     for start in starts:
         try:
             frame = initial_scene(model, survey, start.initial) if frame is None else frame
@@ -123,7 +123,9 @@ def adjust_jointly(
     return frame, best.near, best.consistency
 
 
-def in_own_frame(before: Scene, state: State, survey: Survey, initial: SimilarityEstimate) -> tuple[Scene, State]:
+def in_own_frame(
+    before: SparseScene, state: State, survey: Survey, initial: SimilarityEstimate
+) -> tuple[SparseScene, State]:
     """Return scene and state in the frame `model` of the solution: axes and metre of geo, as training takes them.
 
     The state was solved in the scene of its start; `survey` has the split into training and test images.
@@ -147,7 +149,7 @@ class _Found(NamedTuple):
     cost: float  # −2 ln likelihood at the stated σ; compares solutions from different starts
 
 
-def _adjust(survey: Survey, scene: Scene, start: Start, estimate: tuple[MountParameter, ...]) -> _Found:
+def _adjust(survey: Survey, scene: SparseScene, start: Start, estimate: tuple[MountParameter, ...]) -> _Found:
     """Alternate between the solution and the variance factors, from the stated σ."""
     fixed = {
         factor.group: factor for factor in (*_marks(survey, scene), *_attitudes(survey, scene.sparse), _ties(scene))
@@ -284,7 +286,7 @@ def _factor(survey: Survey, group: Group, component: VarianceComponent, applied:
     )
 
 
-def _marks(survey: Survey, scene: Scene) -> list[VarianceFactor]:
+def _marks(survey: Survey, scene: SparseScene) -> list[VarianceFactor]:
     """Test the σ of the control points' marks: how well their rays meet in the SfM model."""
     rays = mark_rays(survey.control_points, scene.sparse)
     rays = rays.of_points(rays.marks_of_point >= 2)
@@ -322,7 +324,7 @@ def _independent(survey: Survey, group: Group, component: VarianceComponent) -> 
     return _factor(survey, group, component, 1.0).model_copy(update={"applied": max(applied, 0.01)})
 
 
-def _ties(scene: Scene) -> VarianceFactor:
+def _ties(scene: SparseScene) -> VarianceFactor:
     """State the variance of the image observations of tie points, in square pixels: SfM knows no σ beforehand."""
     network = scene.network
     rows = len(network.obs_point)

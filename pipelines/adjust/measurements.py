@@ -40,7 +40,7 @@ from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.survey.common_points import CommonPoints
 from pipelines.survey.marks import MarkRays, RayErrors, intersect_marks, mark_angles, mark_rays
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.survey.solution import EarlierDate, MeasurementVerdict
 from pipelines.survey.survey import MountParameter, Survey
 
@@ -215,7 +215,7 @@ def attitude_prior(survey: Survey, model: SparseModel) -> RotationPrior | None:
 
 
 def problem_of(
-    scene: Scene,
+    scene: SparseScene,
     survey: Survey,
     *,
     estimate: Iterable[MountParameter] = (),
@@ -273,13 +273,13 @@ def problem_of(
     return Problem(scene.poses, scene.bundle, measured, errors, sigma_datum_m=datum, earlier=date)
 
 
-def rejected_of(scene: Scene, survey: Survey, verdict: MeasurementVerdict) -> Problem | None:
+def rejected_of(scene: SparseScene, survey: Survey, verdict: MeasurementVerdict) -> Problem | None:
     """Return the problem of the measurements that `init-sim3` has rejected; None if there are none."""
     rejected = verdict.rejected(survey)
     return None if rejected is None else problem_of(scene, rejected)
 
 
-def fixes_of(scene: Scene, survey: Survey) -> Fixes | None:
+def fixes_of(scene: SparseScene, survey: Survey) -> Fixes | None:
     """Return the fixes of the registered images, or None without any."""
     fixes, index = fix_correspondences(survey, scene.sparse), scene.sparse.image_index()
     if not len(fixes):
@@ -312,7 +312,7 @@ def _drift_of(survey: Survey, names: tuple[str, ...]) -> FloatArray:
     return shapes
 
 
-def level_term(scene: Scene, survey: Survey) -> Level | None:
+def level_term(scene: SparseScene, survey: Survey) -> Level | None:
     """Return what the photographs know of the vertical, or None if they know nothing."""
     level = level_of(survey, scene.sparse, attitude_prior(survey, scene.sparse))
     if level is None:
@@ -323,7 +323,7 @@ def level_term(scene: Scene, survey: Survey) -> Level | None:
     return Level((turn @ level.up_in_local)[None], (axes @ turn.T)[None], covariance[None])
 
 
-def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
+def control_of(scene: SparseScene, survey: Survey) -> ControlPoints | None:
     """Return the control points with marks in two or more registered images, or None if there is none."""
     rays = mark_rays(survey.control_points, scene.sparse)
     marked = rays.marks_of_point >= 2
@@ -341,7 +341,7 @@ def control_of(scene: Scene, survey: Survey) -> ControlPoints | None:
     )
 
 
-def earlier_of(scene: Scene, survey: Survey) -> EarlierPoints | None:
+def earlier_of(scene: SparseScene, survey: Survey) -> EarlierPoints | None:
     """Return the points in common with an earlier date that two or more registered images see; None: there is none.
 
     Their marks are the observations of the tracks. With the points eliminated, the information of the bundle is
@@ -372,7 +372,7 @@ def earlier_of(scene: Scene, survey: Survey) -> EarlierPoints | None:
     )
 
 
-def _rays_of_tracks(scene: Scene, seen: IntArray) -> MarkRays:
+def _rays_of_tracks(scene: SparseScene, seen: IntArray) -> MarkRays:
     """Return observations (K,) of the SfM model as marks of points that are named by COLMAP's ids."""
     sparse = scene.sparse
     points, point = np.unique(sparse.obs_point[seen], return_inverse=True)
@@ -398,7 +398,7 @@ def _sigma_of_earlier(common: CommonPoints) -> Vector3:
     return vector3(np.maximum(common.sigma_m, _LEAST_SIGMA_COMMON_M))
 
 
-def _of_rays(scene: Scene, rays: MarkRays) -> dict[str, Any]:
+def _of_rays(scene: SparseScene, rays: MarkRays) -> dict[str, Any]:
     """Return the fields of a `MarkedTerm` that its marks decide."""
     return {
         "point": rays.point,
@@ -409,7 +409,7 @@ def _of_rays(scene: Scene, rays: MarkRays) -> dict[str, Any]:
     }
 
 
-def distances_of(scene: Scene, survey: Survey) -> Distances | None:
+def distances_of(scene: SparseScene, survey: Survey) -> Distances | None:
     """Return the control distances whose ends have marks in two or more registered images; None: there is none."""
     wanted = [distance for distance in survey.distances if distance.use == "control"]
     rays = mark_rays([end for distance in wanted for end in distance.ends], scene.sparse)
@@ -441,7 +441,7 @@ def distances_of(scene: Scene, survey: Survey) -> Distances | None:
     return replace(exact, cov=variance[:, None, None])
 
 
-def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:
+def attitudes_of(scene: SparseScene, survey: Survey) -> Attitudes | None:
     """Return the recorded rotations of the registered images that agree with the SfM model, or None."""
     recorded = recorded_rotations(survey, scene.sparse)
     if not len(recorded.image):
@@ -454,7 +454,7 @@ def attitudes_of(scene: Scene, survey: Survey) -> Attitudes | None:
     )
 
 
-def start_of(scene: Scene, problem: Problem) -> State:
+def start_of(scene: SparseScene, problem: Problem) -> State:
     """Return the cameras as SfM left them, at the similarity of the scene, without systematic errors."""
     lenses = len(problem.bundle.sums.lens)
     cameras = np.zeros((len(scene.sparse.image_name), 6))
@@ -507,7 +507,7 @@ def _common_errors(survey: Survey, fixes: Fixes, *, with_datum: bool) -> list[Sy
     return blocks
 
 
-def _mark_covariance(scene: Scene, marks: MarkRays, position: FloatArray) -> FloatArray:
+def _mark_covariance(scene: SparseScene, marks: MarkRays, position: FloatArray) -> FloatArray:
     """Return the covariance (J, 3, 3) of each intersected point (J, 3) in geo that the σ of its marks causes."""
     poses = scene.poses
     center = scene.geo_from_model.apply(poses.cam_center_in_model[marks.camera])

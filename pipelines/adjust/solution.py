@@ -21,7 +21,7 @@ from pipelines.geometry.sparse_model import SparseModel
 from pipelines.geometry.statistics import covariance_root
 from pipelines.survey.measurement_errors import EstimatedError
 from pipelines.survey.report import AccuracySummary
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.survey.solution import (
     Measurement,
     MeasurementVerdict,
@@ -38,7 +38,7 @@ _REJECTED = "is inconsistent with the others at the 99.9 % level"
 
 
 def adjusted(
-    scene: Scene, problem: Problem, state: State, verdict: MeasurementVerdict, rejected: Problem | None = None
+    scene: SparseScene, problem: Problem, state: State, verdict: MeasurementVerdict, rejected: Problem | None = None
 ) -> Posterior:
     """Return a state as the solution of a survey, with its covariances.
 
@@ -117,7 +117,7 @@ def posterior_of(workspace: Workspace, solution: Solution, sfm: SparseModel) -> 
     return load_posterior(workspace.path(product), solution, sfm)
 
 
-def _cameras(scene: Scene, poses: CameraPoses) -> tuple[SolvedCamera, ...]:
+def _cameras(scene: SparseScene, poses: CameraPoses) -> tuple[SolvedCamera, ...]:
     train = set(map(int, scene.train))
     quats = quat_xyzw_from_matrix(poses.cam_from_model)
     translations = -np.einsum("nij,nj->ni", poses.cam_from_model, poses.cam_center_in_model)

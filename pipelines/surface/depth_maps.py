@@ -25,7 +25,7 @@ from pipelines.surface.agreement import THRESHOLDS, agreed_depth, refine, surfac
 from pipelines.surface.matching import UNSEEN, MatchSettings, StereoView
 from pipelines.surface.sweep import NormalMap, SweepPlanes, SweepResult, best_neighbours, plane_sweep, planes_for
 from pipelines.survey.photographs import ImageCache, mapped_array, save_array
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 
 # Layout of the cached arrays, a part of their key: files of another layout lie in another folder.
 _LAYOUT = b"levels: direction, offset, score, step, sharpness, by kernels"
@@ -59,7 +59,7 @@ class DepthMaps:
         folder: cache, in which each scene has a folder of its own.
     """
 
-    def __init__(self, folder: Path, scene: Scene, images: ImageCache) -> None:
+    def __init__(self, folder: Path, scene: SparseScene, images: ImageCache) -> None:
         self.scene, self.images = scene, images
         # Each neighbour of a view needs the view's planes and neighbours, too.
         self._neighbours = cache(lambda index: best_neighbours(scene.network, index, scene.train, _NEIGHBOURS))

@@ -17,7 +17,7 @@ from pipelines.geodesy.enu import Origin, ecef_from_lla, enu_from_ecef
 from pipelines.geometry.trajectory import Trajectory
 from pipelines.surface.measured_cloud import MeasuredCloud, MeasuredFiles, Thinning, read_thinned
 from pipelines.survey.options import CloudCrs
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.survey.survey import Survey
 
 _WGS84 = "EPSG:4979"
@@ -106,7 +106,7 @@ class LidarCloud(Rows):
 
 def read_cloud(
     files: MeasuredFiles,
-    scene: Scene,
+    scene: SparseScene,
     survey: Survey,
     pixel_m: float,
     *,

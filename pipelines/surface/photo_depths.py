@@ -30,7 +30,7 @@ from pipelines.geometry.statistics import mad_sigma
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.surface.measured_cloud import MeasuredCloud, ReadTally, Thinning, suffixes_in
 from pipelines.survey.options import CLOUD_SUFFIXES
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ class PhotoDepths:
 
     crs_names: tuple[str, ...] = ()
 
-    def __init__(self, path: Path, scene: Scene, stated: DepthStatement) -> None:
+    def __init__(self, path: Path, scene: SparseScene, stated: DepthStatement) -> None:
         self._scene, self.stated = scene, stated
         self.along: Along = stated.along or "axis"
         self.path_of, self._unmatched = _matched(path, scene)
@@ -264,7 +264,7 @@ def without_steps(value: Float32Array) -> Float32Array:
     return np.where(known & (furthest <= _STEP * nearest), value, np.nan).astype(np.float32)
 
 
-def _matched(path: Path, scene: Scene) -> tuple[dict[int, Path], list[str]]:
+def _matched(path: Path, scene: SparseScene) -> tuple[dict[int, Path], list[str]]:
     """Return the maps of a path by the photograph to which their names belong, and the names of the others."""
     root = path if path.is_dir() else path.parent
     files = sorted(path.rglob("*")) if path.is_dir() else [path]

@@ -1,4 +1,4 @@
-"""Scene of training and evaluation: cameras, points and photographs in the frame `model`.
+"""Sparse scene of adjustment, training and evaluation: cameras and points of SfM in the frame `model`.
 
 The frame `model` has the axes and the metre of `geo`. Its origin lies near the scene, so that float32 resolves
 fractions of a millimetre. `model_from_local`, its relation to the SfM frame, is fixed when training starts.
@@ -33,7 +33,7 @@ _SHIFT_GRID = (48, 36)  # columns and rows: tie points are not denser
 
 
 @dataclass(frozen=True)
-class Scene:
+class SparseScene:
     """n registered cameras and N points in `model`."""
 
     sparse: SparseModel  # the SfM model (frame `local`)
@@ -52,7 +52,7 @@ class Scene:
             self.model_from_local.apply(self.sparse.cam_center_in_local),
         )
 
-    def of_images(self, images: IntArray) -> Scene:
+    def of_images(self, images: IntArray) -> SparseScene:
         """Return the scene of some cameras (K,), in ascending order, in the same frame."""
         rows = np.unique(images)
         train, test = (np.searchsorted(rows, np.intersect1d(split, rows)) for split in (self.train, self.test))
@@ -92,7 +92,7 @@ def network_of(sparse: SparseModel, poses: CameraPoses, point_in_model: FloatArr
     )
 
 
-def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> Scene:
+def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity, shift: FloatArray) -> SparseScene:
     """Return the scene of a sparse model, whose origin lies at a `shift` (3,) in `geo`.
 
     Raises:
@@ -106,10 +106,10 @@ def make_scene(sparse: SparseModel, survey: Survey, model_from_local: Similarity
             "too-few-training-images",
             f"{len(train)} training images are registered; at least two are needed.",
         )
-    return Scene(sparse, model_from_local, Similarity(translation=shift), train, test)
+    return SparseScene(sparse, model_from_local, Similarity(translation=shift), train, test)
 
 
-def initial_scene(sparse: SparseModel, survey: Survey, initial: SimilarityEstimate) -> Scene:
+def initial_scene(sparse: SparseModel, survey: Survey, initial: SimilarityEstimate) -> SparseScene:
     """Return the scene at the start of training, its origin at the median SfM point, rounded to a metre.
 
     Raises as `make_scene`.
@@ -120,7 +120,7 @@ def initial_scene(sparse: SparseModel, survey: Survey, initial: SimilarityEstima
     return make_scene(sparse, survey, model_from_local, shift)
 
 
-def adjusted_scene(sparse: SparseModel, survey: Survey, adjustment: Solution) -> Scene:
+def adjusted_scene(sparse: SparseModel, survey: Survey, adjustment: Solution) -> SparseScene:
     """Return the scene in the frame of an adjustment; `geo_from_model` is the pure shift that comes nearest to it.
 
     Raises as `make_scene`.
@@ -130,7 +130,7 @@ def adjusted_scene(sparse: SparseModel, survey: Survey, adjustment: Solution) ->
     return make_scene(sparse, survey, model_from_local, adjustment.similarity.apply(middle) - middle)
 
 
-def load_adjusted_scene(workspace: Workspace, product: str = ADJUSTMENT) -> tuple[Solution, Survey, Scene]:
+def load_adjusted_scene(workspace: Workspace, product: str = ADJUSTMENT) -> tuple[Solution, Survey, SparseScene]:
     """Read the adjustment, the survey with its variance factors, and the scene.
 
     `product` is the adjustment: that of `init-sim3`, or the solution that blocks share.

@@ -34,7 +34,7 @@ from pipelines.splat.surface import ObservedPoints
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.area import Area
 from pipelines.survey.photographs import ImageCache
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.train.region import TrainingRegion
 from pipelines.train.surface import SceneSurface, SurfacePoints, spread_evenly
 
@@ -55,7 +55,7 @@ class Background:
     sigma_m: FloatArray
 
 
-def background(scene: Scene, images: ImageCache, points: FloatArray) -> Background:
+def background(scene: SparseScene, images: ImageCache, points: FloatArray) -> Background:
     """Return points on the rays of all image cells of the training views that show none of the known points (N, 3).
 
     The z axis of `model` points up, and the ground is a plane below most of the points.
@@ -84,7 +84,7 @@ def background(scene: Scene, images: ImageCache, points: FloatArray) -> Backgrou
     return Background(place[first], rgb[first], sigma_m[first])
 
 
-def _empty_cells(scene: Scene, index: int, camera: Pinhole, points: FloatArray) -> FloatArray:
+def _empty_cells(scene: SparseScene, index: int, camera: Pinhole, points: FloatArray) -> FloatArray:
     """Return the cells (E, 2), as column and row, that have no point in them or in a cell beside them."""
     rows = max(1, round(_BACKGROUND_COLUMNS * camera.height / camera.width))
     in_cam = (points - scene.poses.cam_center_in_model[index]) @ scene.poses.cam_from_model[index].T
@@ -134,7 +134,7 @@ _RAY_COLUMNS = 64  # along the longer side of a view: neighbouring rays meet nei
 
 
 def fallback_points(
-    scene: Scene,
+    scene: SparseScene,
     maps: DepthMaps,
     count: int,
     seed: int,
@@ -167,7 +167,9 @@ def fallback_points(
     return SurfacePoints(place[kept], rgb[kept], np.full((len(kept), 3), np.nan))
 
 
-def _ground_depth(scene: Scene, index: int, camera: Pinhole, ground: PointSurface, wanted: BoolArray) -> FloatArray:
+def _ground_depth(
+    scene: SparseScene, index: int, camera: Pinhole, ground: PointSurface, wanted: BoolArray
+) -> FloatArray:
     """Return the depth (H, W) of the ground in a view, in metres, from a few rays around the wanted pixels.
 
     It is NaN where a ray meets no ground, and away from the wanted pixels.
@@ -221,7 +223,7 @@ def background_plane(points: SurfacePoints, count: int, seed: int) -> tuple[Surf
     return SurfacePoints(plane, _colours(points, plane, seed), normal), side_m
 
 
-def hidden(points: FloatArray, scene: Scene, maps: DepthMaps) -> BoolArray:
+def hidden(points: FloatArray, scene: SparseScene, maps: DepthMaps) -> BoolArray:
     """Return which of points (K, 3) in `model` lie behind known depths in most of the training views facing them.
 
     A point that no view faces is hidden, too.
@@ -279,7 +281,7 @@ class TrainingScene:
     `area` is what must be sharp; None: everything.
     """
 
-    scene: Scene
+    scene: SparseScene
     images: ImageCache
     surface: SceneSurface | None = None
     region: TrainingRegion | None = None

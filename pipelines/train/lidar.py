@@ -34,7 +34,7 @@ from pipelines.surface.photo_depths import PhotoDepths
 from pipelines.surface.registration import Registration, registration
 from pipelines.surface.visibility import DepthViews, Viewpoints
 from pipelines.survey.lidar_report import HeldOutPoints, LidarArea, LidarRegistration, LidarReport
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.survey.survey import Survey
 from pipelines.train.lidar_surface import CloudVerdict, FusedSurface, surfels_of, verdict
 from pipelines.train.options import LidarOptions
@@ -197,7 +197,7 @@ def lidar_surface(
     return LidarSurface(surface, report, judged, cloud, held_out)
 
 
-def draw_changes(path: Path, lidar: LidarSurface, scene: Scene) -> None:
+def draw_changes(path: Path, lidar: LidarSurface, scene: SparseScene) -> None:
     """Write the map of the places that have changed as PNG."""
     shift = scene.geo_from_model.translation  # a pure shift at the start of the training
     areas = [
@@ -309,7 +309,7 @@ def free_space(cloud: LidarCloud, gone: BoolArray, surface_in_model: FloatArray)
 def _checked(
     compared: Registration,
     cloud: LidarCloud,
-    scene: Scene,
+    scene: SparseScene,
     georeference: SimilarityRecord,
     options: LidarOptions,
 ) -> LidarRegistration:
@@ -360,7 +360,7 @@ def _height_difference(cloud: FloatArray, surface_in_model: FloatArray) -> tuple
     return float(np.median(medians[0][1][mine] - medians[1][1][theirs])), len(common)
 
 
-def _listed_areas(judged: CloudVerdict, scene: Scene, survey: Survey) -> tuple[LidarArea, ...]:
+def _listed_areas(judged: CloudVerdict, scene: SparseScene, survey: Survey) -> tuple[LidarArea, ...]:
     areas = []
     for area in judged.areas[:_MOST_LISTED]:
         center = scene.geo_from_model.apply(area.center_in_model)

@@ -16,7 +16,7 @@ from pipelines.adjust.terms import Planes
 from pipelines.core.types import FloatArray
 from pipelines.geometry.rotations import log_so3
 from pipelines.splat.exposure import FrozenExposures
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.survey.solution import Solution
 from pipelines.survey.survey import MOUNT_PARAMETERS, Survey
 
@@ -33,7 +33,7 @@ def frozen_exposures(solution: Solution, device: torch.device) -> FrozenExposure
 def measured_problem(
     solution: Solution,
     survey: Survey,
-    scene: Scene,
+    scene: SparseScene,
     *,
     control_points: bool = True,
     planes: Planes | None = None,
@@ -55,7 +55,7 @@ def measured_problem(
     )
 
 
-def state_of(solution: Solution, scene: Scene, errors: SystematicErrors) -> State:
+def state_of(solution: Solution, scene: SparseScene, errors: SystematicErrors) -> State:
     """Return a solution as corrections of SfM's cameras and lens, with values of systematic errors."""
     sfm, poses, lenses = scene.poses, solution.poses, scene.sparse.lenses
     turn = -log_so3(np.swapaxes(sfm.cam_from_model, 1, 2) @ poses.cam_from_model)
@@ -87,7 +87,7 @@ def error_estimates(solution: Solution, errors: SystematicErrors) -> tuple[Float
     return value, sigma
 
 
-def solved_at(solution: Solution, survey: Survey, scene: Scene, problem: Problem, state: State) -> Posterior:
+def solved_at(solution: Solution, survey: Survey, scene: SparseScene, problem: Problem, state: State) -> Posterior:
     """Return a state of the measurements, which must be determined, as a solution with its covariances.
 
     The verdict of the solution before it on each measurement stands.

@@ -34,7 +34,7 @@ from pipelines.survey.lidar_report import LidarReport
 from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import ImageCache
-from pipelines.survey.scene import Scene, load_adjusted_scene, photographs
+from pipelines.survey.scene import SparseScene, load_adjusted_scene, photographs
 from pipelines.survey.solution import GeolocatedPoints, LensVignetting, Solution, TrainedModel
 from pipelines.train.compilation import compile_kernels
 from pipelines.train.estimate import estimate_training, training_size, with_effort
@@ -123,7 +123,7 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     return _summary(model, metrics, record, None if lidar is None else lidar.report)
 
 
-def measured_files(options: TrainOptions, scene: Scene) -> MeasuredFiles | None:
+def measured_files(options: TrainOptions, scene: SparseScene) -> MeasuredFiles | None:
     """Return the files of `--lidar`, checked; None: there are none."""
     if options.lidar is None:
         return None

@@ -8,7 +8,7 @@ from pipelines.core.types import BoolArray, ByteArray, FloatArray, IntArray
 from pipelines.geometry.cameras import undistort
 from pipelines.splat.exposure import PointColours, adjusted_exposures
 from pipelines.survey.photographs import ImageCache
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 
 _TRACKS = 300  # of a photograph, the longest: three gains need no more
 _PHOTOGRAPHS = 16  # of a track
@@ -16,7 +16,7 @@ _AROUND_PX = 5  # side of the square whose mean colour counts: a pixel at a corn
 _DARKEST, _BRIGHTEST = 4 / 255, 250 / 255  # a clipped channel does not show its exposure
 
 
-def exposures_from_tracks(scene: Scene, images: ImageCache, progress: Progress = SILENT) -> FloatArray:
+def exposures_from_tracks(scene: SparseScene, images: ImageCache, progress: Progress = SILENT) -> FloatArray:
     """Return the exposures (n, 3, 4) of all photographs, (A | b) of `splat.exposure`.
 
     Their mean over the training photographs is the identity. Each photograph is read once, and memory holds the
@@ -39,7 +39,7 @@ def exposures_from_tracks(scene: Scene, images: ImageCache, progress: Progress =
     return adjusted_exposures(observed, len(images), scene.train)
 
 
-def _observations_in_use(scene: Scene) -> IntArray:
+def _observations_in_use(scene: SparseScene) -> IntArray:
     """Return the rows of the observations of the points that count, ascending.
 
     These are the longest tracks, each taken as long as one of its photographs has too few. The pairs of photographs

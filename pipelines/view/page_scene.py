@@ -178,7 +178,7 @@ def changed_regions(workspace: Workspace, survey: Survey, frame: ViewFrame) -> l
 
 
 def _drawn_regions(path: Path, surface: Path, survey: Survey, frame: ViewFrame, *, doubtful: bool) -> list[Json]:
-    found: list[Json] = []
+    regions: list[Json] = []
     places = 0
     try:
         wkt, polygons, rows = read_regions(path, ("name", "net_m3", "sigma_m3"), doubtful=doubtful)
@@ -189,18 +189,18 @@ def _drawn_regions(path: Path, surface: Path, survey: Survey, frame: ViewFrame, 
                 xy = np.array(part.exterior.coords)
                 places += len(xy)
                 if places > _MOST_PLACES:
-                    return found
+                    return regions
                 height = sampled_raster(surface, xy)
                 if not np.isfinite(height).any():
                     continue
                 height = np.where(np.isfinite(height), height, np.nanmedian(height))
                 at = frame.from_geo(crs.geo_from_xyz(np.column_stack([xy, height])))
                 outline = {"at": np.round(at, 2).tolist(), "raised": net_m3 > 0, "doubtful": doubtful}
-                found.append({"text": text, **outline})
+                regions.append({"text": text, **outline})
                 text = ""
     except GeorefError:
         return []
-    return found
+    return regions
 
 
 def _crs(wkt: str, survey: Survey, frame: ViewFrame) -> TargetCrs:

@@ -27,7 +27,7 @@ from pipelines.geometry.intersection import intersection_jacobian
 from pipelines.geometry.network import Network
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.sparse_model import SparseModel
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.survey.solution import MeasurementVerdict
 from pipelines.survey.survey import Fix, Mark, Survey, SurveyedPoint
 from tests.bundle_scenes import SIGMA_PX, adjuster, exact_network, noisy, pixels, readjusted, size
@@ -68,7 +68,7 @@ class Setting:
     truth: Network = EXACT
 
 
-def scene_of(network: Network) -> Scene:
+def scene_of(network: Network) -> SparseScene:
     """The scene of an SfM model in the frame `geo`."""
     center = network.cam_center_in_world
     count = len(network.point_in_world)
@@ -87,7 +87,7 @@ def scene_of(network: Network) -> Scene:
         obs_image=network.obs_image,
         obs_xy_px=network.obs_xy_px,
     )
-    return Scene(model, Similarity(), Similarity(), np.arange(IMAGES), np.arange(0))
+    return SparseScene(model, Similarity(), Similarity(), np.arange(IMAGES), np.arange(0))
 
 
 @cache

@@ -20,7 +20,7 @@ from pipelines.core.products import save_npz
 from pipelines.geometry.rotations import exp_so3
 from pipelines.geometry.similarity import Similarity
 from pipelines.survey.marks import mark_rays
-from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.scene import SparseScene, initial_scene
 from pipelines.survey.solution import MeasurementVerdict
 from pipelines.survey.survey import Survey
 from tests.drawn_surveys import Receiver, drawn, flight, missed, surveyed
@@ -33,7 +33,7 @@ FLIGHT = flight(25, 150)
 
 
 @cache
-def measured() -> tuple[Scene, Survey]:
+def measured() -> tuple[SparseScene, Survey]:
     rng = np.random.default_rng(4)
     receiver = Receiver((0.3, 0.3, 0.5), (0.05, 0.05, 0.08))
     survey = surveyed(FLIGHT, drawn(FLIGHT, rng), receiver, 0.02, rng)

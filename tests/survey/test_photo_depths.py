@@ -22,7 +22,7 @@ from pipelines.surface.lidar_cloud import LidarCloud, planes_of
 from pipelines.surface.measured_cloud import Thinning, read_thinned
 from pipelines.surface.photo_depths import Along, DepthStatement, PhotoDepths, holds_depth_maps
 from pipelines.surface.registration import registration
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.train.lidar_surface import TrustedLidar, verdict
 from pipelines.train.options import LidarOptions
 from tests.geometry_files import write_exr
@@ -50,7 +50,7 @@ NAMES = tuple(f"flight/IMG_{number:02d}.JPG" for number in range(12))
 SHIFT = np.array([7.0, -3.0, 2.0])
 
 
-def scene_of(names: tuple[str, ...] = NAMES) -> Scene:
+def scene_of(names: tuple[str, ...] = NAMES) -> SparseScene:
     """Twelve cameras over the town, the last one of a test photograph; `geo` lies beside `model`."""
     turn, count = VIEWS.cam_from_world, len(names)
     none = np.zeros(0, np.int64)
@@ -59,7 +59,9 @@ def scene_of(names: tuple[str, ...] = NAMES) -> Scene:
         -np.einsum("nij,nj->ni", turn, VIEWS.center_in_world),
         none, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), none, none, np.zeros((0, 2)),
     )  # fmt: skip
-    return Scene(sparse, Similarity(), Similarity(translation=SHIFT), np.arange(count - 1), np.array([count - 1]))
+    return SparseScene(
+        sparse, Similarity(), Similarity(translation=SHIFT), np.arange(count - 1), np.array([count - 1])
+    )
 
 
 class StereoMaps:
@@ -110,7 +112,7 @@ def write_maps(folder: Path, kind: str, town: Town = TOWN, *, along: Along = "ax
     return {"exr": 1.0, "tif": 0.001}.get(kind, 0.002)
 
 
-def checked(folder: Path, stated: DepthStatement, scene: Scene | None = None) -> PhotoDepths:
+def checked(folder: Path, stated: DepthStatement, scene: SparseScene | None = None) -> PhotoDepths:
     files = PhotoDepths(folder, scene or scene_of(), stated)
     files.check(cast(Any, StereoMaps()))
     return files

@@ -10,7 +10,7 @@ import numpy as np
 from pipelines.geometry.cameras import Camera, undistort
 from pipelines.geometry.similarity import Similarity
 from pipelines.survey.photographs import ImageCache, Photograph
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.train.track_exposures import exposures_from_tracks
 from tests.scenes import STATED, TrueScene, make_scene, sparse_model
 
@@ -56,7 +56,7 @@ def test_exposures_of_photographs_follow_from_their_tracks(tmp_path: Path) -> No
     train = np.delete(np.arange(9), TEST)
     exposure[train] -= exposure[train].mean(axis=0) - np.eye(3, 4)
     sparse = sparse_model(scene, STATED, rng)
-    setting = Scene(sparse, Similarity(), Similarity(), train, np.array([TEST]))
+    setting = SparseScene(sparse, Similarity(), Similarity(), train, np.array([TEST]))
     found = exposures_from_tracks(setting, photographs(scene, exposure, tmp_path))
     place = np.append(ground_colour(rng.uniform(-50, 50, (200, 2))), np.ones((200, 1)), axis=1)
     error = place @ np.swapaxes(found - exposure, 1, 2)

@@ -12,7 +12,7 @@ import pytest
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.similarity import Similarity
 from pipelines.survey.photographs import ImageCache, Photograph
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.survey.scene import make_scene as in_model
 from pipelines.train.initial_gaussians import background, ground_plane
 from tests.scenes import Measured, Noise, make_scene, sparse_model, survey_of
@@ -24,7 +24,7 @@ GREY, BLUE = 90, 200
 
 
 @pytest.fixture
-def scene() -> Scene:
+def scene() -> SparseScene:
     """An orbit that looks at the horizon; SfM points only on the scene's middle."""
     truth, rng = make_scene(images=6, points=400), np.random.default_rng(0)
     cloud = np.column_stack([rng.uniform(-30, 30, (400, 2)), rng.uniform(0, 1, 400)])
@@ -48,7 +48,7 @@ def scene() -> Scene:
 
 
 @pytest.fixture
-def images(scene: Scene, tmp_path: Path) -> ImageCache:
+def images(scene: SparseScene, tmp_path: Path) -> ImageCache:
     """Photographs that are grey below the horizon and blue above."""
     picture = np.full((180, 240, 3), GREY, np.uint8)
     picture[:90] = (BLUE, 120, 60)  # BGR
@@ -59,7 +59,7 @@ def images(scene: Scene, tmp_path: Path) -> ImageCache:
     return ImageCache(tmp_path / "cache", shots, 240)
 
 
-def test_points_lie_on_the_ground_or_in_the_sky(scene: Scene, images: ImageCache) -> None:
+def test_points_lie_on_the_ground_or_in_the_sky(scene: SparseScene, images: ImageCache) -> None:
     found = background(scene, images, scene.point_in_model)
     middle = np.median(scene.point_in_model, axis=0)
     distance = np.linalg.norm(found.point_in_model - middle, axis=1)
@@ -74,7 +74,7 @@ def test_points_lie_on_the_ground_or_in_the_sky(scene: Scene, images: ImageCache
     assert (distance[ground] < 9 * radius).all()
 
 
-def test_colours_are_those_of_the_rays(scene: Scene, images: ImageCache) -> None:
+def test_colours_are_those_of_the_rays(scene: SparseScene, images: ImageCache) -> None:
     found = background(scene, images, scene.point_in_model)
     high = found.point_in_model[:, 2] > 40.0  # above every camera
     assert (found.rgb[high] == (60, 120, BLUE)).all()
@@ -82,14 +82,14 @@ def test_colours_are_those_of_the_rays(scene: Scene, images: ImageCache) -> None
     assert (found.rgb[low] == GREY).all()
 
 
-def test_places_with_sfm_points_are_left_to_them(scene: Scene, images: ImageCache) -> None:
+def test_places_with_sfm_points_are_left_to_them(scene: SparseScene, images: ImageCache) -> None:
     found = background(scene, images, scene.point_in_model)
     ground = found.point_in_model[:, 2] < 5.0
     in_the_cloud = (np.abs(found.point_in_model[ground, :2]) < 15.0).all(axis=1)
     assert in_the_cloud.sum() <= 0.02 * len(found.sigma_m)
 
 
-def test_size_is_that_of_the_cell_seen_from_its_camera(scene: Scene, images: ImageCache) -> None:
+def test_size_is_that_of_the_cell_seen_from_its_camera(scene: SparseScene, images: ImageCache) -> None:
     found = background(scene, images, scene.point_in_model)
     middle, radius = np.median(scene.point_in_model, axis=0), 0.0
     radius = float(np.percentile(np.linalg.norm(scene.point_in_model - middle, axis=1), 90))
@@ -98,14 +98,14 @@ def test_size_is_that_of_the_cell_seen_from_its_camera(scene: Scene, images: Ima
     assert (found.sigma_m > 0).all()
 
 
-def test_neighbouring_views_do_not_repeat_a_place(scene: Scene, images: ImageCache) -> None:
+def test_neighbouring_views_do_not_repeat_a_place(scene: SparseScene, images: ImageCache) -> None:
     found = background(scene, images, scene.point_in_model)
     level = np.round(np.log2(found.sigma_m))
     cube = np.floor(found.point_in_model / (2.0 ** (level + 1))[:, None])
     assert len(np.unique(np.column_stack([level, cube]), axis=0)) == len(cube)
 
 
-def test_cloud_that_fills_the_view_needs_none(scene: Scene, images: ImageCache) -> None:
+def test_cloud_that_fills_the_view_needs_none(scene: SparseScene, images: ImageCache) -> None:
     rng = np.random.default_rng(1)
     everywhere = rng.normal(0, 200, (60_000, 3))
     full = replace(scene, sparse=replace(scene.sparse, point_in_local=everywhere))

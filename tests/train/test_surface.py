@@ -13,7 +13,7 @@ import torch
 from pipelines.splat.initialise import InitialisationOptions
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache, save_array
-from pipelines.survey.scene import Scene, make_scene, photographs
+from pipelines.survey.scene import SparseScene, make_scene, photographs
 from pipelines.train.initial_gaussians import TrainingScene, depth_loss_points, fallback_points, initial_gaussians
 from pipelines.train.surface import SceneSurface, spread_evenly
 from tests.scenes import GEO_FROM_LOCAL, write_workspace
@@ -47,7 +47,7 @@ def _photograph(rendered: Rendered, folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def material(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rendered, Scene, ImageCache]:
+def material(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rendered, SparseScene, ImageCache]:
     rendered = make_rendered()
     root = tmp_path_factory.mktemp("hill")
     _photograph(rendered, root / "photos")
@@ -57,7 +57,7 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rendered, Scene,
 
 
 @pytest.fixture(scope="module")
-def maps(material: tuple[Rendered, Scene, ImageCache], tmp_path_factory: pytest.TempPathFactory) -> DepthMaps:
+def maps(material: tuple[Rendered, SparseScene, ImageCache], tmp_path_factory: pytest.TempPathFactory) -> DepthMaps:
     found = DepthMaps(tmp_path_factory.mktemp("surface"), *material[1:])
     found.build()
     return found
@@ -69,7 +69,7 @@ def surface(maps: DepthMaps) -> SceneSurface:
 
 
 def test_surface_is_the_hill(
-    maps: DepthMaps, surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+    maps: DepthMaps, surface: SceneSurface, material: tuple[Rendered, SparseScene, ImageCache]
 ) -> None:
     errors, seen = [], []
     for index in material[1].train:
@@ -107,7 +107,7 @@ def test_sample_knows_the_slope_of_the_hill(surface: SceneSurface) -> None:
 
 
 def test_fallback_points_lie_at_the_height_of_the_sfm_points(
-    surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+    surface: SceneSurface, material: tuple[Rendered, SparseScene, ImageCache]
 ) -> None:
     scene = material[1]
     east = fallback_points(scene, surface.maps, 300, 0, lambda points: points[:, 0] > 0)
@@ -120,7 +120,7 @@ def test_fallback_points_lie_at_the_height_of_the_sfm_points(
     assert len(nothing.rgb) == 0
 
 
-def test_maps_are_kept_and_continued(maps: DepthMaps, material: tuple[Rendered, Scene, ImageCache]) -> None:
+def test_maps_are_kept_and_continued(maps: DepthMaps, material: tuple[Rendered, SparseScene, ImageCache]) -> None:
     first = sorted(maps.folder.iterdir())
     before = {path: path.stat().st_mtime_ns for path in first}
     lost = first[3]
@@ -133,17 +133,19 @@ def test_maps_are_kept_and_continued(maps: DepthMaps, material: tuple[Rendered, 
     assert all(path.stat().st_mtime_ns == before[path] for path in first if path != lost)
 
 
-def test_another_scene_has_other_maps(maps: DepthMaps, material: tuple[Rendered, Scene, ImageCache]) -> None:
+def test_another_scene_has_other_maps(maps: DepthMaps, material: tuple[Rendered, SparseScene, ImageCache]) -> None:
     _, scene, images = material
     fewer = replace(scene, train=scene.train[:-1])
     assert DepthMaps(maps.folder.parent, fewer, images).folder != maps.folder
 
 
-def test_another_processor_finds_the_maps(maps: DepthMaps, material: tuple[Rendered, Scene, ImageCache]) -> None:
+def test_another_processor_finds_the_maps(
+    maps: DepthMaps, material: tuple[Rendered, SparseScene, ImageCache]
+) -> None:
     """The last bits of a solution are those of its processor."""
     _, scene, images = material
 
-    def with_translations(offset: float, factor: float) -> Scene:
+    def with_translations(offset: float, factor: float) -> SparseScene:
         sparse = scene.sparse
         translation = factor * sparse.translation_cam_from_local + offset
         points = factor * sparse.point_in_local
@@ -157,14 +159,14 @@ def test_another_processor_finds_the_maps(maps: DepthMaps, material: tuple[Rende
 
 
 def test_test_views_show_nothing_of_the_surface(
-    maps: DepthMaps, material: tuple[Rendered, Scene, ImageCache]
+    maps: DepthMaps, material: tuple[Rendered, SparseScene, ImageCache]
 ) -> None:
     held_out = {f"{int(index):06d}" for index in material[1].test}
     assert not held_out & {path.name.split(".")[0] for path in maps.folder.iterdir()}
 
 
 def test_gaussians_start_on_the_surface(
-    surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+    surface: SceneSurface, material: tuple[Rendered, SparseScene, ImageCache]
 ) -> None:
     _, scene, images = material
     options = InitialisationOptions(sh_degree=0)
@@ -177,7 +179,7 @@ def test_gaussians_start_on_the_surface(
 
 
 def test_gaussians_start_as_discs_however_many_sfm_points_there_are(
-    surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+    surface: SceneSurface, material: tuple[Rendered, SparseScene, ImageCache]
 ) -> None:
     _, scene, images = material
     most = len(scene.point_in_model)  # as many as there may be: balls at all of them would leave no room for discs
@@ -192,7 +194,7 @@ def test_gaussians_start_as_discs_however_many_sfm_points_there_are(
 
 
 def test_fewer_start_on_a_surface_of_which_less_is_known(
-    maps: DepthMaps, surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache], tmp_path: Path
+    maps: DepthMaps, surface: SceneSurface, material: tuple[Rendered, SparseScene, ImageCache], tmp_path: Path
 ) -> None:
     _, scene, images = material
     part = DepthMaps(tmp_path, scene, images)
@@ -213,7 +215,7 @@ def test_fewer_start_on_a_surface_of_which_less_is_known(
 
 
 def test_depth_loss_points_are_those_of_the_view(
-    surface: SceneSurface, material: tuple[Rendered, Scene, ImageCache]
+    surface: SceneSurface, material: tuple[Rendered, SparseScene, ImageCache]
 ) -> None:
     _, scene, images = material
     known = depth_loss_points(TrainingScene(scene, images, surface), torch.device("cpu"))

@@ -27,7 +27,7 @@ from pipelines.geometry.cameras import project
 from pipelines.splat.memory import USABLE, TrainingSize, predicted_peak_bytes
 from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock, scaffold_gaussians
 from pipelines.survey.photographs import pinhole_of
-from pipelines.survey.scene import Scene, load_adjusted_scene
+from pipelines.survey.scene import SparseScene, load_adjusted_scene
 from pipelines.train.options import PlanOptions
 
 _COLUMNS, _ROWS = 16, 12  # of a photograph's grid
@@ -51,7 +51,7 @@ class ObservedSurface:
         return np.bincount(self.obs_image[rows], self.obs_share[rows], minlength=images).astype(np.float64)
 
 
-def observed_surface(scene: Scene, most_observations: int = _MOST_OBSERVATIONS) -> ObservedSurface:
+def observed_surface(scene: SparseScene, most_observations: int = _MOST_OBSERVATIONS) -> ObservedSurface:
     """Return the surface that the training images of a scene observe; too many observations are thinned evenly."""
     sparse = scene.sparse
     step = -(-len(sparse.obs_point) // most_observations)
@@ -181,7 +181,7 @@ def run(stage: StageRun, options: PlanOptions) -> Summary:
     return Summary(f"{len(plan.blocks)} blocks of {plan.photographs} photographs", values)
 
 
-def plan_blocks(scene: Scene, options: PlanOptions, progress: Progress = SILENT) -> BlockPlan:
+def plan_blocks(scene: SparseScene, options: PlanOptions, progress: Progress = SILENT) -> BlockPlan:
     """Return the division of a scene into blocks.
 
     Raises:
@@ -210,9 +210,9 @@ def plan_blocks(scene: Scene, options: PlanOptions, progress: Progress = SILENT)
 
 @dataclass(frozen=True)
 class _Planner:
-    """Scene with its observed surface and the options of the plan."""
+    """Sparse scene with its observed surface and the options of the plan."""
 
-    scene: Scene
+    scene: SparseScene
     surface: ObservedSurface
     options: PlanOptions
 

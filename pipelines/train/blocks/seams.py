@@ -27,7 +27,7 @@ from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.survey.photographs import ImageCache
-from pipelines.survey.scene import Scene, load_adjusted_scene, photographs
+from pipelines.survey.scene import SparseScene, load_adjusted_scene, photographs
 from pipelines.survey.solution import Solution
 from pipelines.train.georeference.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
@@ -106,7 +106,7 @@ class _SeamTrainer:
     folder: Path
     plan: BlockPlan
     solution: Solution
-    scene: Scene
+    scene: SparseScene
     images: ImageCache
     scaffold: Gaussians
     backend: Rasterizer

@@ -32,7 +32,7 @@ from pipelines.geometry.bundle import similarity_modes
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.statistics import root_information
 from pipelines.splat.surface import depth_at
-from pipelines.survey.scene import Scene
+from pipelines.survey.scene import SparseScene
 from pipelines.survey.solution import GeolocatedPoints, Solution
 from pipelines.survey.survey import Survey
 from pipelines.train.georeference.unknowns import SolutionUnknowns, TensorSimilarity, cauchy, moved_tensors
@@ -79,7 +79,7 @@ class LongPairs:
         return at.similarity().scale * distance - self.distance_in_geo
 
 
-def long_pairs(scene: Scene, fixes: Fixes, points: GeolocatedPoints | None, seed: int) -> LongPairs | None:
+def long_pairs(scene: SparseScene, fixes: Fixes, points: GeolocatedPoints | None, seed: int) -> LongPairs | None:
     """Return 300 long distances across the scene: between located points, else between cameras with fixes.
 
     Located points are functions of the same few fixes (`adjust.alignment`), and contain the lens's errors as well.
@@ -147,7 +147,7 @@ class DepthMarks:
         return self.xy[rows] + self.xy_by_lens[rows] @ lens if len(lens) else self.xy[rows]
 
 
-def depth_marks(scene: Scene, survey: Survey, marks: ControlPoints, errors: SystematicErrors) -> DepthMarks:
+def depth_marks(scene: SparseScene, survey: Survey, marks: ControlPoints, errors: SystematicErrors) -> DepthMarks:
     """Return the marks of the control points for projection onto the rendered surface.
 
     The surface's error has a σ of `SURFACE_SIGMA` times the distance, along each axis. All marks of a point share
@@ -334,7 +334,7 @@ class GeoProblem(torch.nn.Module):
 def refining_problem(
     posterior: Posterior,
     survey: Survey,
-    scene: Scene,
+    scene: SparseScene,
     measured: Problem,
     options: GeographicOptions,
     *,
@@ -383,7 +383,7 @@ def _normal_of(posterior: Posterior, held: Problem, start: State) -> NormalMatri
     return near.normal(posterior_weights(near.residuals))
 
 
-def frozen_problem(solution: Solution, scene: Scene) -> GeoProblem:
+def frozen_problem(solution: Solution, scene: SparseScene) -> GeoProblem:
     """Return the problem of a training that freezes similarity, cameras and lens at a solution."""
     poses = solution.poses
     state = replace(

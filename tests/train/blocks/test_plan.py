@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.core.errors import ResourceError
-from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.scene import SparseScene, initial_scene
 from pipelines.train.blocks.plan import observed_surface, plan_blocks
 from pipelines.train.options import PlanOptions
 from tests.refusals import refused
@@ -15,18 +15,18 @@ from tests.scenes import Measured, Noise, initial, make_scene, sparse_model, sur
 OPTIONS = PlanOptions(max_gaussians=100_000, max_image_size=320, sh_degree=3, blocks=4)
 
 
-def flat_scene() -> Scene:
+def flat_scene() -> SparseScene:
     """Sixty-four cameras in a grid that look straight down on 120 m of ground, 80 m below."""
     scene, rng = make_scene("grid", images=64, points=3000), np.random.default_rng(0)
     return initial_scene(sparse_model(scene, Noise(), rng), survey_of(scene, Noise(), Measured(), rng), initial())
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> SparseScene:
     return flat_scene()
 
 
-def test_shares_of_blocks_and_views(scene: Scene) -> None:
+def test_shares_of_blocks_and_views(scene: SparseScene) -> None:
     plan = plan_blocks(scene, OPTIONS)
     assert len(plan.blocks) == 4
     np.testing.assert_allclose([block.share for block in plan.blocks], 0.25, atol=0.01)
@@ -36,7 +36,7 @@ def test_shares_of_blocks_and_views(scene: Scene) -> None:
     np.testing.assert_allclose(np.sum(shares, axis=0), 1.0)  # what an image shows lies in one of the cells
 
 
-def test_cameras_of_a_block_are_those_that_see_it(scene: Scene) -> None:
+def test_cameras_of_a_block_are_those_that_see_it(scene: SparseScene) -> None:
     """On flat ground below level cameras, an image shows a block if its footprint reaches into it."""
     half = 80.0 * np.array([600 / 1020.0, 450 / 1018.0])  # of a footprint, metres
     for block in plan_blocks(scene, OPTIONS).blocks:
@@ -56,7 +56,7 @@ def test_cameras_of_a_block_are_those_that_see_it(scene: Scene) -> None:
                 assert camera not in chosen
 
 
-def test_memory_decides_on_the_number(scene: Scene) -> None:
+def test_memory_decides_on_the_number(scene: SparseScene) -> None:
     # So many Gaussians that they, not the process around them, take the memory.
     many = OPTIONS.model_copy(update={"max_gaussians": 2_000_000})
     whole = plan_blocks(scene, many.model_copy(update={"blocks": 1})).blocks[0]
@@ -70,7 +70,7 @@ def test_memory_decides_on_the_number(scene: Scene) -> None:
         plan_blocks(scene, OPTIONS.model_copy(update={"blocks": None, "block_memory": 0.05}))
 
 
-def test_visible_gaussians_are_counted(scene: Scene) -> None:
+def test_visible_gaussians_are_counted(scene: SparseScene) -> None:
     """A view of the one block shows the share of the ground that lies in its footprint."""
     plan = plan_blocks(scene, OPTIONS.model_copy(update={"blocks": 1}))
     points = scene.point_in_model
@@ -82,7 +82,7 @@ def test_visible_gaussians_are_counted(scene: Scene) -> None:
     assert plan.blocks[0].visible == pytest.approx(100_000 * np.mean(in_view), rel=0.2)
 
 
-def test_few_observations_tell_the_same(scene: Scene) -> None:
+def test_few_observations_tell_the_same(scene: SparseScene) -> None:
     few = observed_surface(scene, most_observations=len(scene.sparse.obs_point) // 4)
     every = observed_surface(scene)
     assert len(few.obs_point) < 0.3 * len(every.obs_point)

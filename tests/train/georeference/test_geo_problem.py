@@ -20,7 +20,7 @@ from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.system import Problem, cost_at, minimise
 from pipelines.adjust.terms import MarkedTerm, Term
 from pipelines.core.errors import DegenerateGeometryError, InputError
-from pipelines.survey.scene import Scene, adjusted_scene
+from pipelines.survey.scene import SparseScene, adjusted_scene
 from pipelines.survey.solution import GeolocatedPoints, Solution
 from pipelines.survey.survey import Survey
 from pipelines.train.georeference.problem import (
@@ -53,7 +53,7 @@ class Adjusted:
     """A survey after `init-sim3`."""
 
     survey: Survey
-    scene: Scene
+    scene: SparseScene
     posterior: Posterior
     points: GeolocatedPoints
 

@@ -18,12 +18,12 @@ from pipelines.geometry.bundle import similarity_modes
 from pipelines.geometry.cameras import CameraPoses
 from pipelines.geometry.rotations import exp_so3, log_so3, skew
 from pipelines.geometry.similarity import Similarity
-from pipelines.survey.scene import Scene, initial_scene
+from pipelines.survey.scene import SparseScene, initial_scene
 from pipelines.survey.survey import KnownDistance
 from pipelines.train.georeference.unknowns import SolutionUnknowns, exp_so3_tensor
 from tests.scenes import initial, material, session_of
 
-Every = tuple[Scene, Problem, State, NormalMatrix]
+Every = tuple[SparseScene, Problem, State, NormalMatrix]
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -34,7 +34,7 @@ def test_exponential_and_its_derivative(size: float) -> None:
     assert torch.autograd.gradcheck(exp_so3_tensor, (vector.requires_grad_(),))
 
 
-def solved(*, lidar: bool) -> tuple[Scene, Problem, State, NormalMatrix]:
+def solved(*, lidar: bool) -> tuple[SparseScene, Problem, State, NormalMatrix]:
     """Measurements of all kinds, of two sessions, with all systematic errors, at their minimum."""
     _, sparse, survey = material(images=8, points=80)
     images = tuple(
@@ -65,7 +65,7 @@ def solved(*, lidar: bool) -> tuple[Scene, Problem, State, NormalMatrix]:
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["no lidar", "lidar"])
-def every(request: pytest.FixtureRequest) -> tuple[Scene, Problem, State, NormalMatrix]:
+def every(request: pytest.FixtureRequest) -> tuple[SparseScene, Problem, State, NormalMatrix]:
     return solved(lidar=request.param)
 
 
