@@ -1,5 +1,7 @@
 """Verbosity of the program, the form of its log lines, and its messages for programs (`--json-progress`)."""
 
+from __future__ import annotations
+
 import logging
 import os
 import select
@@ -11,11 +13,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from types import TracebackType
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from pipelines.core.child import ORPHAN_S, MessageSender
 from pipelines.core.sentences import printable, printable_lines
-from pipelines.core.types import JsonValue
+
+if TYPE_CHECKING:  # loads numpy, which `georef --help` does not wait for
+    from pipelines.core.types import JsonValue
 
 
 @dataclass(frozen=True)

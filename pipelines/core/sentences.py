@@ -3,11 +3,15 @@
 A terminal obeys escape sequences, and marks that turn the direction of writing show another name than there is.
 """
 
+from __future__ import annotations
+
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from pipelines.core.types import JsonValue
+if TYPE_CHECKING:  # loads numpy, which `georef --help` does not wait for
+    from pipelines.core.types import JsonValue
 
 _SHOWN = 8
 
