@@ -5,7 +5,7 @@ in cascaded cost volumes (Gu et al., doi 10.1109/CVPR42600.2020.00257). A window
 the roof where the roof is, and the ground where the ground is. A sweep of planes takes that ground for roof.
 """
 
-import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -127,22 +127,36 @@ def agreed_depth(own: SweepResult, others: list[SweepResult]) -> Float32Array:
     return np.where(agreed, mean, 0.0).astype(np.float32)
 
 
+DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # down and right: to one of each two opposite neighbours
+
+
+def bends(
+    depth: Float32Array, reach_px: int, directions: Sequence[tuple[int, int]] = DIRECTIONS
+) -> Iterator[Float32Array]:
+    """Yield for each direction z/z₁ + z/z₂ − 2 (H, W) of a depth z between z₁ and z₂, `reach_px` to either side.
+
+    It is 0 on a plane, at any angle of view, as the inverse depth of a plane is linear on the image, and negative
+    where a surface ends before another. NaN: one of the three is not known (0), or outside.
+    """
+    height, width = depth.shape
+    inverse = np.where(depth > 0, 1 / np.maximum(depth, np.float32(1e-9)), np.float32(np.nan))
+    around = np.pad(inverse, reach_px, constant_values=np.nan)
+    for down, right in np.multiply(directions, reach_px).tolist():
+        ahead = around[reach_px + down :, reach_px + right :][:height, :width]
+        behind = around[reach_px - down :, reach_px - right :][:height, :width]
+        yield (ahead + behind) * depth - np.float32(2)
+
+
 def without_rims(depth: Float32Array, reach_px: int) -> Float32Array:
     """Return a depth map (H, W) with 0 where a surface ends before another within `reach_px`.
 
     Foreground fattening is the reason: the contrast of an edge dominates the windows across it, so that the ground
-    beside a roof matches as roof. The outermost half window of a surface is therefore none. The test compares
-    inverse depths, which are linear on a plane however steep the view.
+    beside a roof matches as roof. The outermost half window of a surface is therefore none.
     """
-    height, width = depth.shape
-    inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-9), np.nan)
     ends = np.zeros(depth.shape, dtype=np.bool_)
     for reach in range(1, reach_px + 1):
-        around = np.pad(inverse, reach, constant_values=np.nan)
-        for down, right in itertools.product((-reach, 0, reach), repeat=2):
-            ahead = around[reach + down :, reach + right :][:height, :width]
-            behind = around[reach - down :, reach - right :][:height, :width]
-            ends |= ahead < (2 - _RIM) * inverse - behind
+        for bend in bends(depth, reach):
+            ends |= bend < -_RIM
     return np.where(ends, np.float32(0), depth)
 
 

@@ -150,7 +150,7 @@ def _chosen(
             x, y, z = _surface_at(depth, row, column, lens, turn, center)
             if not (x >= box[0] and y >= box[1] and x < box[2] and y < box[3]):
                 continue
-            # The inverse depth of a plane is linear on the image, at any angle of view.
+            # As `agreement.bends`, of one pixel.
             bend = max(
                 abs(own / depth[row, column - reach] + own / depth[row, column + reach] - 2),
                 abs(own / depth[row - reach, column] + own / depth[row + reach, column] - 2),

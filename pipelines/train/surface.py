@@ -12,6 +12,7 @@ import numpy as np
 
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray, joined_rows, rows_of
 from pipelines.geometry.footprints import count_voxels, thin_to_voxels
+from pipelines.surface.agreement import bends
 from pipelines.surface.depth_maps import DepthMaps
 
 _WINDOW_PX = 5  # side of the window that contrast is averaged over
@@ -20,7 +21,7 @@ _MOST = 12.0
 _BROKEN = 0.3  # weight where the surface bends or ends
 _SAMPLE = 4  # of rows and columns, for the median
 _REACH_PX = 3  # of the test for an unbroken surface
-_PLANE_BEND = 0.005  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂
+_PLANE_BEND = 0.005  # limit of a surface's bend to either side
 
 
 def depth_loss_weights(rgb: ByteArray, depth_m: Float32Array) -> Float32Array:
@@ -50,20 +51,11 @@ def _contrast(rgb: ByteArray) -> Float32Array:
 
 def _unbroken(depth_m: Float32Array) -> BoolArray:
     """Return whether the surface goes on as a plane (H, W) in all directions around each pixel."""
-    height, width = depth_m.shape
-    # The inverse depth of a plane is linear on the image, at any angle of view.
-    inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, np.float32(1e-9)), np.float32(np.nan))
-    around = np.pad(inverse, _REACH_PX, constant_values=np.nan)
-    plane = np.ones(depth_m.shape, dtype=np.bool_)
-    for down, right in ((0, _REACH_PX), (_REACH_PX, 0), (_REACH_PX, _REACH_PX), (_REACH_PX, -_REACH_PX)):
-        ahead = around[_REACH_PX + down :, _REACH_PX + right :][:height, :width]
-        behind = around[_REACH_PX - down :, _REACH_PX - right :][:height, :width]
-        plane &= np.abs(ahead + behind - 2 * inverse) < _PLANE_BEND * inverse
-    return plane
+    return np.logical_and.reduce([np.abs(bend) < _PLANE_BEND for bend in bends(depth_m, _REACH_PX)])
 
 
 _NORMAL_REACH_PX = 3
-_BEND = 0.02  # limit of |z/z₁ + z/z₂ − 2| for a depth z between opposite neighbours z₁, z₂ on a smooth surface
+_BEND = 0.02  # limit of a smooth surface's bend to either side
 _CANDIDATES = 8  # drawn for each wanted point, so that they cover places that few views see
 
 
@@ -138,10 +130,8 @@ class SceneSurface:
             (rows[inner] + _NORMAL_REACH_PX * down, columns[inner] + _NORMAL_REACH_PX * right)
             for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0))
         ]
-        # The inverse depth of a plane is linear on the image, at any angle of view.
-        with np.errstate(divide="ignore"):
-            around = np.stack([depth[rows[inner], columns[inner]] / depth[place] for place in places])
-        smooth = (np.abs(around[::2] + around[1::2] - 2) < _BEND).all(axis=0)
+        bent = bends(depth, _NORMAL_REACH_PX, ((0, 1), (1, 0)))
+        smooth = np.logical_and.reduce([np.abs(bend[rows[inner], columns[inner]]) < _BEND for bend in bent])
         right, left, below, above = (self._points(index, *place) for place in places)
         normal = np.cross(right - left, below - above)[smooth]
         normals[inner[smooth]] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
