@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -132,6 +133,8 @@ class StageSpec:
         reads: products, or parts of them, that decide its result.
         product: workspace path of its main product, whose first part is the stage's folder.
         title: what its command does, in one sentence; empty without a command of its own.
+        files: use of each file for people, by workspace path, in the order in which they look for them; a path
+            without a suffix is a folder.
         resumable: whether a partial product can be continued.
         growing: options of which a larger value continues the finished product.
         also: further products in its folder, besides those that the stages of the pipeline read.
@@ -150,6 +153,7 @@ class StageSpec:
     reads: tuple[ProductPart, ...]
     product: str
     title: str = ""
+    files: Mapping[str, str] = field(default_factory=dict, hash=False)
     resumable: bool = False
     growing: tuple[str, ...] = ()
     also: tuple[str, ...] = ()
@@ -244,6 +248,13 @@ PIPELINE: tuple[StageSpec, ...] = (
         reads=(MEASURED, *SOLVED, *whole_products(HELD_OUT, optional=True), APPLIED_RIG),
         product=REPORT,
         title="Measure test views and check points.",
+        files={
+            "evaluate/report.json": "measured and predicted accuracy, for the record",
+            "evaluate/cameras.csv": "σ of every photograph",
+            "evaluate/points.csv": "error of each check and control point",
+            "evaluate/accuracy.png": "map of the predicted accuracy, with the errors of the points",
+            "evaluate/accuracy.csv": "the same map as a table",
+        },
         product_version=4,  # with the area that is measured
     ),
     StageSpec(
@@ -253,6 +264,9 @@ PIPELINE: tuple[StageSpec, ...] = (
         reads=DELIVERED_SPLAT,
         product=SPLAT,
         title="Write the splat as a PLY with its place on Earth.",
+        files={
+            "export/splat.ply": "the splat as trained, to look at and to edit (SuperSplat, Blender)",
+        },
         delivers="file",
     ),
 )
@@ -265,6 +279,10 @@ CLEAN = StageSpec(
     reads=(MEASURED, *whole_products(SPARSE, ADJUSTMENT, MODEL, GAUSSIANS), APPLIED_RIG),
     product=CLEANED,
     title="Remove floaters from the trained model, and make it smaller.",
+    files={
+        "clean/gaussians.ply": "the cleaned model, which files of the splat take; in the frame of the training",
+        "clean/removed.ply": "the floaters that were removed, to look at; in the same frame",
+    },
     also=(CLEANING,),
 )
 
@@ -291,6 +309,9 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=MEASURABLE_SPLAT,
         title="Write a second PLY whose centres lie on the surface, for viewers that measure by them.",
+        files={
+            "measurable/splat.measurable.ply": "the splat to measure in, for viewers that pick centres; larger",
+        },
         delivers="file",
         resumable=True,
         called="export-ply --measurable",
@@ -302,6 +323,21 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         reads=(MEASURED, *whole_products(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product="raster/orthophoto.tif",
         title="Write orthophoto, surface model and σ as rasters.",
+        files={
+            "raster/orthophoto.tif": "orthophoto, for GIS and CAD",
+            "raster/bands.tif": "bands of a multispectral rig, or temperatures, for GIS",
+            "raster/dsm.tif": "surface model, for volumes, profiles and GIS",
+            "raster/dtm.tif": "terrain model: the ground without houses, trees and cars",
+            "raster/sigma_dtm.tif": "vertical σ of the terrain model",
+            "raster/measured.tif": "which cells are measured, and which interpolated",
+            "raster/interpolated.geojson": "outlines of the interpolated parts, for maps",
+            "raster/sigma_h.tif": "horizontal σ of each cell",
+            "raster/sigma_v.tif": "vertical σ of each cell",
+            "raster/contours.gpkg": "contour lines, for GIS",
+            "raster/contours.dxf": "contour lines, for CAD",
+            "raster/hillshade.png": "picture of the surface model",
+            "raster/preview.png": "picture of the orthophoto",
+        },
         delivers="folder",
         resumable=True,
         also=("raster/dsm.tif", "raster/measured.tif", "raster/sigma_h.tif", "raster/sigma_v.tif"),
@@ -314,6 +350,11 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         reads=(MEASURED, *whole_products(SPARSE, MODEL, TRAIN_POSTERIOR, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=CLOUD,
         title="Write the surface as a georeferenced point cloud (LAZ).",
+        files={
+            "cloud/cloud.laz": "point cloud with σ, for surveying software (CloudCompare, QGIS, PDAL)",
+            "cloud/cloud.copc.laz": "the same point cloud in levels of detail, for viewers on the web (COPC)",
+            "cloud/cloud.ply": "the same point cloud, for viewers without LAZ",
+        },
         delivers="file",
         resumable=True,
     ),
@@ -324,6 +365,12 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         reads=(MEASURED, *whole_products(SPARSE, MODEL, GAUSSIANS), APPLIED_RIG, HEADLINE),
         product=MESH,
         title="Write the surface as a triangle mesh with texture.",
+        files={
+            "mesh/mesh.ply": "triangle mesh with coloured vertices, to measure and edit (CloudCompare, MeshLab)",
+            "mesh/mesh.glb": "the mesh with texture, for viewers and engines (Blender, Unity, web)",
+            "mesh/mesh.obj": "the mesh with texture, for programs without glTF",
+            "mesh/mesh_crs.ply": "the mesh in a CRS, with double coordinates, for surveying software",
+        },
         delivers="file",
         resumable=True,
         also=(MESH_GLB,),
@@ -335,6 +382,9 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         reads=DELIVERED_SPLAT,
         product=SPZ,
         title="Write the splat as SPZ, for viewers on the web.",
+        files={
+            "spz/splat.spz": "the splat compressed, for viewers on the web",
+        },
         delivers="file",
     ),
     StageSpec(
@@ -344,6 +394,9 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         reads=DELIVERED_SPLAT,
         product=SOG,
         title="Write the splat as streamed SOG, in levels of detail.",
+        files={
+            "sog/lod-meta.json": "the splat in levels of detail, for PlayCanvas' viewers on the web (streamed SOG)",
+        },
         delivers="folder",
     ),
     StageSpec(
@@ -353,6 +406,12 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         reads=DELIVERED_SPLAT,
         product=TILES,
         title="Write the splat as 3D Tiles, for web globes.",
+        files={
+            "tiles/tileset.json": "the splat as 3D Tiles, for web globes (CesiumJS)",
+            "tiles/index.html": "page that shows the tiles on the globe",
+            "tiles/tiles.3tz": "the same 3D Tiles in one file, for desktop GIS",
+            "tiles/splat.glb": "the splat in one glTF file",
+        },
         delivers="folder",
         also=(TILES_GLB,),
     ),
@@ -370,6 +429,9 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         ),
         product=HTML,
         title="Write the splat with its viewer as one HTML file.",
+        files={
+            "html/splat.html": "the splat with its viewer in one file, to send by mail: opens without a network",
+        },
         delivers="file",
     ),
     StageSpec(
@@ -379,6 +441,16 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         reads=(MEASURED, *SOLVED, APPLIED_RIG, HEADLINE),
         product="cameras/cameras.csv",
         title="Write the trained cameras for other programs.",
+        files={
+            "cameras/cameras.csv": "positions, angles and σ of the photographs, for photogrammetry",
+            "cameras/camera_covariances.csv": "full covariance of every photograph, for weighted solutions",
+            "cameras/covariances.npz": "the same as arrays, and the covariance of every tie point",
+            "cameras/colmap": "adjusted cameras and points as a COLMAP model, for other trainers",
+            "cameras/undistorted": "photographs without distortion with their COLMAP model, for trainers of splats",
+            "cameras/transforms.json": "adjusted cameras for nerfstudio",
+            "cameras/sparse_pc.ply": "points for nerfstudio",
+            "cameras/footprints.geojson": "ground that each photograph shows, for maps",
+        },
         delivers="folder",
         also=(
             "cameras/colmap",
@@ -396,6 +468,9 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         reads=(MEASURED, *SOLVED, *TAKEN, APPLIED_RIG, HEADLINE),
         product=OPF,
         title="Write cameras, points, marks and splat as an OPF project.",
+        files={
+            "opf/project.opf": "cameras, tie and marked points, cloud and splat as OPF, for photogrammetry (PIX4D)",
+        },
         delivers="folder",
     ),
     StageSpec(
@@ -414,6 +489,10 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         ),
         product=REPORT_PAGE,
         title="Write the report: one page, and its PDF.",
+        files={
+            "report/report.html": "report to hand in: one page with accuracy, points, photographs and processing",
+            "report/report.pdf": "the same report, for printing",
+        },
         delivers="file",
     ),
 )
@@ -504,6 +583,13 @@ BLOCK_PARTS = (PLAN_BLOCKS, SOLVE, TRAIN_SCAFFOLD, TRAIN_BLOCK, TRAIN_SEAMS)
 
 STAGES = (*PIPELINE, CLEAN, *DELIVERABLES, CHANGE, ADJUST, *BLOCK_PARTS)
 BY_NAME = {spec.name: spec for spec in (*PIPELINE, CLEAN, *DELIVERABLES, CHANGE)}
+
+# Use of each file of a result, for `georef info` and for the report's list of what was delivered.
+DESCRIPTIONS = {
+    path: use
+    for spec in (CLEAN, BY_NAME["export-ply"], *DELIVERABLES, BY_NAME["evaluate"])
+    for path, use in spec.files.items()
+}
 
 
 def producer_of(path: str) -> StageSpec:

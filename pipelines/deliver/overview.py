@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.core.descriptions import DESCRIPTIONS
 from pipelines.core.errors import GeorefError
 from pipelines.core.figures import Headline
 from pipelines.core.products import Remark
-from pipelines.core.stages import BY_NAME, DELIVERABLES, GAUSSIANS, REPORT, StageSpec
+from pipelines.core.stages import BY_NAME, DELIVERABLES, DESCRIPTIONS, GAUSSIANS, REPORT, StageSpec
 from pipelines.core.staleness import StageState, cautions_by_stage, document_of_cautions, status
 from pipelines.core.types import FloatArray, Json, Vector3, vector3
 from pipelines.core.workspace import Workspace

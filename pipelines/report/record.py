@@ -13,7 +13,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from pipelines.core.descriptions import DESCRIPTIONS
 from pipelines.core.errors import GeorefError, InputError
 from pipelines.core.figures import DEPTH_ERRORS, length_text
 from pipelines.core.manifest import hash_file
@@ -24,6 +23,7 @@ from pipelines.core.stages import (
     CHANGE,
     CHANGE_FIGURES,
     DELIVERABLES,
+    DESCRIPTIONS,
     LIDAR,
     LIDAR_MAP,
     REFERENCE_HISTOGRAM,

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from pipelines.core.descriptions import DESCRIPTIONS
 from pipelines.core.errors import InputError, MissingProductError
 from pipelines.core.products import NOT_CHECKED, Remark, load_json, save_json
-from pipelines.core.stages import DELIVERABLES, MODEL, SPLAT, SURVEY
+from pipelines.core.stages import DELIVERABLES, DESCRIPTIONS, MODEL, SPLAT, SURVEY
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.overview import overview
 from pipelines.geodesy.enu import ecef_from_enu
