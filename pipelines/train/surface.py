@@ -51,7 +51,7 @@ def _contrast(rgb: ByteArray) -> Float32Array:
 
 def _unbroken(depth_m: Float32Array) -> BoolArray:
     """Return whether the surface goes on as a plane (H, W) in all directions around each pixel."""
-    return np.logical_and.reduce([np.abs(bend) < _PLANE_BEND for bend in bends(depth_m, _REACH_PX)])
+    return np.asarray(np.all([np.abs(bend) < _PLANE_BEND for bend in bends(depth_m, _REACH_PX)], axis=0))
 
 
 _NORMAL_REACH_PX = 3
@@ -131,7 +131,7 @@ class SceneSurface:
             for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0))
         ]
         bent = bends(depth, _NORMAL_REACH_PX, ((0, 1), (1, 0)))
-        smooth = np.logical_and.reduce([np.abs(bend[rows[inner], columns[inner]]) < _BEND for bend in bent])
+        smooth = np.all([np.abs(bend[rows[inner], columns[inner]]) < _BEND for bend in bent], axis=0)
         right, left, below, above = (self._points(index, *place) for place in places)
         normal = np.cross(right - left, below - above)[smooth]
         normals[inner[smooth]] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
