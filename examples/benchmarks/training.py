@@ -134,6 +134,15 @@ def trainer_on(root: Path, options: TrainOptions) -> tuple[JointTrainer, SparseS
     return trainer, scene, images
 
 
+def trained_on(root: Path, options: TrainOptions) -> tuple[JointTrainer, SparseScene, ImageCache, float]:
+    """What `trainer_on` returns after the last iteration, and the processor seconds of all iterations."""
+    trainer, scene, images = trainer_on(root, options)
+    worked = time.process_time()
+    while trainer.iteration < trainer.options.iterations:
+        trainer.step()
+    return trainer, scene, images, time.process_time() - worked
+
+
 def curve(arguments: argparse.Namespace) -> None:
     """Print PSNR on training and test views against time, for each strategy and limit of Gaussians."""
     print("strategy   processor s  seconds  iteration  gaussians  train PSNR dB  test PSNR dB")
@@ -220,9 +229,7 @@ def presets(arguments: argparse.Namespace) -> None:
     for preset, seed in product(arguments.presets, arguments.seeds):
         options = TrainOptions.model_validate({"preset": preset, "seed": seed, "backend": arguments.backend})
         start = now(arguments.backend)
-        trainer, scene, images = trainer_on(arguments.workspace, options)
-        while trainer.iteration < trainer.options.iterations:
-            trainer.step()
+        trainer, scene, images, _ = trained_on(arguments.workspace, options)
         taken, solution = now(arguments.backend) - start, load_adjusted_scene(Workspace(arguments.workspace))[0]
         renderer = ModelRenderer(
             *(trained_model(trainer, solution), scene.sparse, trainer.optimizer.gaussians.detached()),
@@ -250,12 +257,8 @@ def georeference(arguments: argparse.Namespace) -> None:
     for seed, form in product(arguments.seeds, arguments.forms):
         given = {"preset": "smoke", "iterations": arguments.iterations, "seed": seed, "georeference": form}
         options = TrainOptions.model_validate({**given, "backend": arguments.backend})
-        trainer, scene, images = trainer_on(arguments.workspace, options)
-        worked = time.process_time()
-        while trainer.iteration < arguments.iterations:
-            trainer.step()
-        worked = time.process_time() - worked
-        test = ViewQuality(trainer, images).psnr(scene.test)
+        trainer, scene, images, worked = trained_on(arguments.workspace, options)
+        test = psnr_of_test_views(trainer, scene, images)
         found.setdefault(form, []).append([worked, test, *placed(arguments.workspace, trainer, options)])
         print(f"{form:12s} {seed:6d}  " + "  ".join(f"{one:10.3f}" for one in found[form][-1]), flush=True)
     for form, runs in found.items():

@@ -127,11 +127,11 @@ def agreed_depth(own: SweepResult, others: list[SweepResult]) -> Float32Array:
     return np.where(agreed, mean, 0.0).astype(np.float32)
 
 
-DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # down and right: to one of each two opposite neighbours
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # down and right: to one of each two opposite neighbours
 
 
 def bends(
-    depth: Float32Array, reach_px: int, directions: Sequence[tuple[int, int]] = DIRECTIONS
+    depth: Float32Array, reach_px: int, directions: Sequence[tuple[int, int]] = _DIRECTIONS
 ) -> Iterator[Float32Array]:
     """Yield for each direction z/z₁ + z/z₂ − 2 (H, W) of a depth z between z₁ and z₂, `reach_px` to either side.
 
