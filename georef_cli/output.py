@@ -15,11 +15,11 @@ from rich.text import Text
 from georef_cli import tables
 from georef_cli.tables import ByWidth, Renderable, Safe, literal, plain_table
 from pipelines.core.errors import GeorefError
+from pipelines.core.json_values import JsonValue
 from pipelines.core.products import Remark, dump_json, union
 from pipelines.core.runner import Outcome
 from pipelines.core.stages import ADJUSTMENT, MODEL, REPORT
 from pipelines.core.staleness import cautions_by_stage, document_of_cautions
-from pipelines.core.types import JsonValue
 from pipelines.core.workspace import Workspace
 from pipelines.survey.headline import headline_of
 

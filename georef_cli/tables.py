@@ -16,6 +16,7 @@ from rich.table import Table
 
 from pipelines.compare.table import POINT_FIGURES, REFERENCE_HEADS, Comparison, cells, reference_cells, remarks_on
 from pipelines.core.figures import DEPTH_ERRORS, ERRORS, MISSING, Headline
+from pipelines.core.json_values import Json, JsonValue
 from pipelines.core.options import notation
 from pipelines.core.plan import OptionOrigin
 from pipelines.core.products import Remark
@@ -23,7 +24,6 @@ from pipelines.core.runner import Outcome
 from pipelines.core.sentences import duration, printable, printable_lines
 from pipelines.core.stages import BY_NAME, REPORT
 from pipelines.core.staleness import StageState
-from pipelines.core.types import Json, JsonValue
 from pipelines.core.workspace import Workspace
 from pipelines.survey.headline import PointLine, point_lines
 from pipelines.survey.lidar_report import HeldOutDepths

@@ -1,7 +1,5 @@
 """Verbosity of the program, the form of its log lines, and its messages for programs (`--json-progress`)."""
 
-from __future__ import annotations
-
 import logging
 import os
 import select
@@ -13,13 +11,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from types import TracebackType
-from typing import TYPE_CHECKING, TextIO
+from typing import TextIO
 
 from pipelines.core.child import ORPHAN_S, MessageSender
+from pipelines.core.json_values import JsonValue
 from pipelines.core.sentences import printable, printable_lines
-
-if TYPE_CHECKING:  # loads numpy, which `georef --help` does not wait for
-    from pipelines.core.types import JsonValue
 
 
 @dataclass(frozen=True)

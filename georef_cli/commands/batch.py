@@ -18,13 +18,13 @@ from georef_cli.output import print_json, print_result, print_rich
 from georef_cli.tables import WIDE, ByWidth, Renderable, literal, plain_table
 from pipelines.core.errors import GeorefError
 from pipelines.core.figures import ACCURACY_H, ACCURACY_V, CHECK_POINTS, MISSING
+from pipelines.core.json_values import Json
 from pipelines.core.options import OptionValue, input_paths, remembered
 from pipelines.core.plan import plan
 from pipelines.core.progress import Progress
 from pipelines.core.sentences import about, duration
 from pipelines.core.stages import BY_NAME
 from pipelines.core.staleness import stage_config
-from pipelines.core.types import Json
 from pipelines.jobs.batch import BatchTable, PlannedMission
 from pipelines.jobs.missions import Mission, load_missions
 

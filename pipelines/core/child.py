@@ -5,8 +5,6 @@ while it works, and its failed checks abort the process. In a child both are har
 at once, and a crash becomes one error.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import json
@@ -21,14 +19,12 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, TextIO
+from typing import IO, Any, TextIO
 
 from pipelines.core import errors
 from pipelines.core.files import storage_failure_of
+from pipelines.core.json_values import JsonValue
 from pipelines.core.progress import SILENT, Progress, ProgressTask
-
-if TYPE_CHECKING:  # loads numpy, which `georef --help` does not wait for
-    from pipelines.core.types import JsonValue
 
 log = logging.getLogger(__name__)
 

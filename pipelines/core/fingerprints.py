@@ -13,12 +13,12 @@ from typing import Any
 from pipelines import __version__
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
+from pipelines.core.json_values import JsonValue
 from pipelines.core.manifest import FileRecord, Memo, hash_file
 from pipelines.core.options import InputMarker, StageOptions, flag_name, input_markers, input_paths
 from pipelines.core.product_parts import ProductPart
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import StageSpec
-from pipelines.core.types import JsonValue
 from pipelines.core.workspace import Workspace
 
 # A larger file, such as a bag, counts by its size and by samples: reading gigabytes for each `georef status` would

@@ -24,9 +24,10 @@ from pydantic.fields import FieldInfo
 from pipelines.core.errors import InputError
 from pipelines.core.extras import Extra, require
 from pipelines.core.files import file_size, replace_text
+from pipelines.core.json_values import JsonValue
 from pipelines.core.product_parts import ProductPart
 from pipelines.core.sentences import fault_sentence
-from pipelines.core.types import JsonValue, Vector3
+from pipelines.core.types import Vector3
 from pipelines.core.validators import require_text
 
 OptionValue = Any  # of its field's type, or as a file or the command line has it

@@ -18,8 +18,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, V
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, read_npz
+from pipelines.core.json_values import JsonValue
 from pipelines.core.sentences import fault_sentence, with_remedy
-from pipelines.core.types import JsonValue, Matrix3, Quaternion
+from pipelines.core.types import Matrix3, Quaternion
 from pipelines.core.validators import covariance, image_name, unit_quaternion
 
 # Users may write products by hand: a file larger than any survey's is refused before it is read.

@@ -3,15 +3,11 @@
 A terminal obeys escape sequences, and marks that turn the direction of writing show another name than there is.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # loads numpy, which `georef --help` does not wait for
-    from pipelines.core.types import JsonValue
+from pipelines.core.json_values import JsonValue
 
 _SHOWN = 8
 

@@ -16,9 +16,6 @@ BoolArray = NDArray[np.bool_]
 ByteArray = NDArray[np.uint8]
 AnyArray = NDArray[Any]  # of any type
 
-JsonValue = Any  # of JSON, TOML or YAML: an object, list, text, number, truth value or nothing
-Json = dict[str, JsonValue]  # object
-
 # `FunctionCtx` of torch, whose class declares neither `saved_tensors` nor what a forward pass keeps.
 AutogradContext = Any
 

@@ -24,9 +24,10 @@ from numpy.typing import ArrayLike
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.files import replace_text
+from pipelines.core.json_values import Json
 from pipelines.core.products import Remark, is_checked, save_npz, union
 from pipelines.core.stages import GAUSSIANS
-from pipelines.core.types import FloatArray, Json
+from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportCamerasOptions
 from pipelines.deliver.placement import Placement, median_values, require_space, scene_sigma, solved_placement

@@ -20,9 +20,10 @@ import torch
 from pipelines.adjust.posterior import Posterior
 from pipelines.adjust.solution import posterior_of
 from pipelines.core.errors import DegenerateGeometryError, InputError
+from pipelines.core.json_values import Json
 from pipelines.core.products import Remark, is_checked, union
 from pipelines.core.stages import MODEL, OPF
-from pipelines.core.types import BoolArray, FloatArray, Json, rows_of
+from pipelines.core.types import BoolArray, FloatArray, rows_of
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.deliver.options import ExportOpfOptions
 from pipelines.deliver.splat import load_splat

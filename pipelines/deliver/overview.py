@@ -12,10 +12,11 @@ import numpy as np
 
 from pipelines.core.errors import GeorefError
 from pipelines.core.figures import Headline
+from pipelines.core.json_values import Json
 from pipelines.core.products import Remark
 from pipelines.core.stages import BY_NAME, DELIVERABLES, DESCRIPTIONS, GAUSSIANS, REPORT, StageSpec
 from pipelines.core.staleness import StageState, cautions_by_stage, document_of_cautions, status
-from pipelines.core.types import FloatArray, Json, Vector3, vector3
+from pipelines.core.types import FloatArray, Vector3, vector3
 from pipelines.core.workspace import Workspace
 from pipelines.deliver.placement import solved_placement
 from pipelines.formats.splat_ply import read_centres

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, label
 
 from pipelines import __version__
+from pipelines.core.json_values import Json
 from pipelines.core.progress import Progress
-from pipelines.core.types import AnyArray, BoolArray, ByteArray, FloatArray, IntArray, Json
+from pipelines.core.types import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from pipelines.deliver.bands import Bands
 from pipelines.deliver.photo_colours import MARGIN, CellColours, PhotoColours
 from pipelines.deliver.raster_window import (

@@ -20,10 +20,11 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, replace_text
+from pipelines.core.json_values import Json
 from pipelines.core.products import Remark
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import TILES_GLB
-from pipelines.core.types import FloatArray, Json, joined_rows
+from pipelines.core.types import FloatArray, joined_rows
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.deliver.options import Compression, ExportTilesOptions
 from pipelines.deliver.pages import TILESET, ScenePage, scene_page, write_scene_page

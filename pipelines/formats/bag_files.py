@@ -18,8 +18,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipelines.core.errors import InputError
+from pipelines.core.json_values import JsonValue
 from pipelines.core.products import Remark
-from pipelines.core.types import JsonValue
 from pipelines.formats.bag_limits import bound_decompressors, check_file, check_files, unpack_file
 
 # Classes of rosbags, by name: a file that mentions one does not load the library.

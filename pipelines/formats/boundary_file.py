@@ -25,8 +25,8 @@ import shapely
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size
+from pipelines.core.json_values import JsonValue
 from pipelines.core.products import Remark
-from pipelines.core.types import JsonValue
 from pipelines.formats.kml import read_kml
 from pipelines.formats.vector_files import ReadLayer, read_layers
 

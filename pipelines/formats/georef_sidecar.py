@@ -21,9 +21,10 @@ from pydantic.alias_generators import to_camel
 from pipelines.core.errors import InputError
 from pipelines.core.figures import Headline
 from pipelines.core.files import replace_text
+from pipelines.core.json_values import JsonValue
 from pipelines.core.products import Product, Remark
 from pipelines.core.sentences import without_folders
-from pipelines.core.types import JsonValue, Matrix4, Quaternion, Row7, Vector3, vector3
+from pipelines.core.types import Matrix4, Quaternion, Row7, Vector3, vector3
 from pipelines.formats.iso_metadata import (
     PLAN_SIGMA,
     STANDARD_ERROR,

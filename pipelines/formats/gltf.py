@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from pipelines.core.errors import InputError
-from pipelines.core.types import Float32Array, Json, Vector3
+from pipelines.core.json_values import Json
+from pipelines.core.types import Float32Array, Vector3
 from pipelines.formats.splat_ply import SplatArrays
 
 SPLATS = "KHR_gaussian_splatting"

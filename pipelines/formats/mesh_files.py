@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from pipelines.core.types import ByteArray, FloatArray, IntArray, Json
+from pipelines.core.json_values import Json
+from pipelines.core.types import ByteArray, FloatArray, IntArray
 from pipelines.formats.cloud_ply import COLOURS, set_columns
 from pipelines.formats.gltf import glb_of
 

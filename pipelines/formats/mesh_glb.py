@@ -17,7 +17,8 @@ import numpy as np
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, reading
-from pipelines.core.types import FloatArray, IntArray, Json
+from pipelines.core.json_values import Json
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.cloud_ply import check_precision
 from pipelines.formats.triangle_mesh import MOST_BYTES, MOST_FACES, TriangleMesh, mesh_of
 from pipelines.geometry.rotations import matrix_from_quat_xyzw

@@ -14,8 +14,9 @@ from typing import IO
 import numpy as np
 
 from pipelines.core.files import remove, replace_text
+from pipelines.core.json_values import Json
 from pipelines.core.products import dump_json
-from pipelines.core.types import AnyArray, ByteArray, Float32Array, FloatArray, Json
+from pipelines.core.types import AnyArray, ByteArray, Float32Array, FloatArray
 from pipelines.formats.gltf import Y_UP_FROM_Z_UP
 
 GLTF, BUFFER = "model/gltf+json", "application/gltf-buffer+bin"

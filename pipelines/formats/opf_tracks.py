@@ -19,8 +19,9 @@ from pydantic.alias_generators import to_camel
 
 from pipelines.core.errors import InputError
 from pipelines.core.files import file_size, reading
+from pipelines.core.json_values import JsonValue
 from pipelines.core.products import load_json
-from pipelines.core.types import FloatArray, JsonValue
+from pipelines.core.types import FloatArray
 from pipelines.formats.solved_cameras import Foreign, TiePoints, vector_of
 
 MATCHES = "OPF_mesh_primitive_matches"

@@ -23,8 +23,9 @@ import numpy as np
 
 from pipelines import __version__
 from pipelines.core.files import replace_text
+from pipelines.core.json_values import Json
 from pipelines.core.products import dump_json
-from pipelines.core.types import FloatArray, Json
+from pipelines.core.types import FloatArray
 from pipelines.formats.camera_files import lens_of
 from pipelines.formats.opf_gltf import ArrayFile, write_points
 from pipelines.formats.opf_tracks import MATCHES

@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipelines.core.errors import InputError, StorageError, storage_error_in
 from pipelines.core.files import file_size, replacing, storage_failure_of
-from pipelines.core.types import AnyArray, FloatArray, Json, JsonValue
+from pipelines.core.json_values import Json, JsonValue
+from pipelines.core.types import AnyArray, FloatArray
 from pipelines.formats.vector_source import gdal, layers_with_shapes, reading_errors, rows_of_table, tables_alone
 from pipelines.geometry.footprints import clipped_ring, ring_area
 

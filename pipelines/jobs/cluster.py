@@ -21,7 +21,7 @@ from urllib.parse import SplitResult, urlsplit
 
 from pipelines.core.errors import ClusterError, InputError
 from pipelines.core.extras import require
-from pipelines.core.types import JsonValue
+from pipelines.core.json_values import JsonValue
 from pipelines.jobs.engine import Job
 
 if TYPE_CHECKING:

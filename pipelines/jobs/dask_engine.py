@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 from pipelines import __version__
 from pipelines.core.errors import ClusterError, WorkspaceBusyError
+from pipelines.core.json_values import JsonValue
 from pipelines.core.progress import Progress, ProgressTask, StopRequest, deferred_interrupts
-from pipelines.core.types import JsonValue
 from pipelines.jobs.cluster import GPU, MEMORY, ClusterAddress, Worker, connected, worker_for, workers_of
 from pipelines.jobs.dask_task import UNFIT, JobRequest, folder_tokens, run_job
 from pipelines.jobs.engine import INTERRUPTED, Job, JobDisplay, JobEnd, tell_end

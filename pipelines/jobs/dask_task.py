@@ -21,8 +21,8 @@ from pipelines import __version__
 from pipelines.core import child
 from pipelines.core.child import python_environment
 from pipelines.core.errors import GeorefError
+from pipelines.core.json_values import JsonValue
 from pipelines.core.machine import available_cores
-from pipelines.core.types import JsonValue
 from pipelines.jobs.cluster import CORES, GPU, MEMORY, ClusterAddress
 from pipelines.jobs.local import JobProcess, ProcessEnd
 from pipelines.jobs.storage import Parcel, arguments_in, worker_exchange

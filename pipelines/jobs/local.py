@@ -23,9 +23,9 @@ from typing import Any
 
 from pipelines.core import child
 from pipelines.core.child import python_command, python_environment
+from pipelines.core.json_values import JsonValue
 from pipelines.core.machine import free_main_memory_bytes, thread_count
 from pipelines.core.progress import Progress, deferred_interrupts
-from pipelines.core.types import JsonValue
 from pipelines.jobs.engine import INTERRUPTED, Engine, Job, JobDisplay, JobEnd, tell_end
 
 log = logging.getLogger(__name__)

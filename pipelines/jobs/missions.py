@@ -15,11 +15,11 @@ from pydantic import ValidationError
 
 from pipelines.core.errors import GeorefError, InputError
 from pipelines.core.files import file_size
+from pipelines.core.json_values import JsonValue
 from pipelines.core.options import CONFIG_FILE, REQUESTS, input_markers, load_toml, read_requests, read_toml
 from pipelines.core.sentences import fault_sentence
 from pipelines.core.stages import BY_NAME, StageSpec, named_deliverables, stage_slice
 from pipelines.core.staleness import Flags
-from pipelines.core.types import JsonValue
 from pipelines.core.validators import stays_inside
 from pipelines.core.workspace import Workspace
 

@@ -26,8 +26,9 @@ import numpy as np
 from pipelines.core.errors import InputError
 from pipelines.core.figures import ACCURACY_H, MISSING
 from pipelines.core.files import file_size
+from pipelines.core.json_values import JsonValue
 from pipelines.core.sentences import duration, printable_lines, without_folders
-from pipelines.core.types import ByteArray, JsonValue
+from pipelines.core.types import ByteArray
 from pipelines.formats.image_file import MAX_PIXELS, header_size, read_bytes
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from pipelines.core.errors import GeorefError, InputError
 from pipelines.core.figures import DEPTH_ERRORS, length_text
+from pipelines.core.json_values import JsonValue
 from pipelines.core.manifest import hash_file
 from pipelines.core.options import flag_name, notation
 from pipelines.core.products import Remark, load_json
@@ -31,7 +32,6 @@ from pipelines.core.stages import (
     StageSpec,
 )
 from pipelines.core.staleness import Flags, cautions_by_stage, status
-from pipelines.core.types import JsonValue
 from pipelines.core.workspace import Workspace
 from pipelines.formats.georef_sidecar import (
     CrsSidecar,

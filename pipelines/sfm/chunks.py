@@ -23,13 +23,14 @@ from pipelines.core.child import run_in_child
 from pipelines.core.errors import DamagedPartialError, GeorefError, InputError
 from pipelines.core.files import remove, replace_text
 from pipelines.core.fingerprints import library_versions
+from pipelines.core.json_values import JsonValue
 from pipelines.core.lock import WriteLock
 from pipelines.core.plan import photograph_folder
 from pipelines.core.products import Product, load_json
 from pipelines.core.progress import Progress
 from pipelines.core.sentences import listed
 from pipelines.core.stages import BY_NAME, SURVEY
-from pipelines.core.types import IntArray, JsonValue
+from pipelines.core.types import IntArray
 from pipelines.core.workspace import StageRun, Workspace
 from pipelines.formats.colmap import quiet_colmap
 from pipelines.jobs.engine import Job, JobEnd

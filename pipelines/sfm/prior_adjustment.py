@@ -19,10 +19,11 @@ from pipelines.adjust.measurements import attitude_prior, fix_correspondences
 from pipelines.adjust.posterior import save_posterior
 from pipelines.core.child import run_in_child
 from pipelines.core.errors import ConvergenceError, DegenerateGeometryError
+from pipelines.core.json_values import JsonValue
 from pipelines.core.products import save_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import ADJUSTMENT, SIM3_POSTERIOR, SPARSE
-from pipelines.core.types import FloatArray, JsonValue
+from pipelines.core.types import FloatArray
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import load_reconstruction, quiet_colmap, read_sparse, write_reconstruction
 from pipelines.geometry.cameras import Reconstruction, pycolmap_module

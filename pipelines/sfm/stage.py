@@ -13,11 +13,11 @@ from typing import Any
 
 from pipelines.core.child import run_in_child
 from pipelines.core.errors import CrashError, DamagedPartialError, DegenerateGeometryError, InputError
+from pipelines.core.json_values import JsonValue
 from pipelines.core.plan import photograph_folder
 from pipelines.core.products import Remark, load_json
 from pipelines.core.progress import Progress
 from pipelines.core.stages import COMMON_POINTS, RIG_MODEL, SURVEY
-from pipelines.core.types import JsonValue
 from pipelines.core.workspace import StageRun, Summary
 from pipelines.formats.colmap import load_reconstruction, quiet_colmap
 from pipelines.geometry.cameras import Reconstruction

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from pipelines.core.child import run_in_child
+from pipelines.core.json_values import JsonValue
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import BoolArray, FloatArray, JsonValue
+from pipelines.core.types import BoolArray, FloatArray
 from pipelines.formats.colmap import quiet_colmap
 from pipelines.formats.mesh_files import read_mesh_ply, write_mesh_ply, write_oriented_points
 from pipelines.surface.mesh import RawMesh, compact, parts_of

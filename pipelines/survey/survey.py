@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from pipelines.core.errors import InputError
+from pipelines.core.json_values import JsonValue
 from pipelines.core.options import WRITTEN, from_text, listed_names
 from pipelines.core.products import Covariance3, ImageName, Product, Remark, Rotation
-from pipelines.core.types import JsonValue, Matrix3, Vector3, vector3
+from pipelines.core.types import Matrix3, Vector3, vector3
 from pipelines.core.validators import image_dir
 from pipelines.geodesy.enu import Origin
 from pipelines.geodesy.vertical import VerticalDatum

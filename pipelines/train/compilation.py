@@ -12,9 +12,9 @@ import torch
 
 from pipelines.core.child import start_in_child
 from pipelines.core.errors import InputError, WorkspaceBusyError
+from pipelines.core.json_values import JsonValue
 from pipelines.core.lock import WriteLock
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import JsonValue
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points
 from pipelines.splat.kernel_cache import cache_folder, compilation_stamp

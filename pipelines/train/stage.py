@@ -17,9 +17,10 @@ import numpy as np
 from pipelines.adjust.posterior import Posterior, load_posterior, save_posterior
 from pipelines.adjust.solution import remarks_of
 from pipelines.adjust.system import minimise
+from pipelines.core.json_values import Json
 from pipelines.core.products import Remark, load_json, save_json, save_npz
 from pipelines.core.stages import HELD_OUT, LIDAR, LIDAR_MAP, MODEL, POINTS, SIM3_POSTERIOR, TRAIN_POSTERIOR
-from pipelines.core.types import Json, vector3
+from pipelines.core.types import vector3
 from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.splat.exposure import Exposures
 from pipelines.splat.gaussians import write_gaussians

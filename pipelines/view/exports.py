@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipelines.core.extras import require
-from pipelines.core.types import Json
+from pipelines.core.json_values import Json
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import drawing
 from pipelines.survey.target_crs import TargetCrs

@@ -10,9 +10,10 @@ import numpy as np
 import shapely
 
 from pipelines.core.errors import GeorefError
+from pipelines.core.json_values import Json
 from pipelines.core.sentences import without_folders
 from pipelines.core.stages import REPORT
-from pipelines.core.types import FloatArray, Json
+from pipelines.core.types import FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.formats.geotiff import sampled_raster
 from pipelines.formats.vector_files import read_contours, read_regions

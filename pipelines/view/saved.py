@@ -17,9 +17,9 @@ import shapely
 from pipelines.core.errors import storage_failures
 from pipelines.core.extras import extra_part
 from pipelines.core.files import replace_texts
+from pipelines.core.json_values import Json
 from pipelines.core.lock import WriteLock
 from pipelines.core.stages import SAVED_MEASUREMENTS
-from pipelines.core.types import Json
 from pipelines.formats.tables import table_text
 from pipelines.formats.vector_files import feature, features_text, replacing_features_gpkg
 from pipelines.survey.saved_measurements import (

@@ -27,8 +27,8 @@ from tornado.netutil import bind_sockets
 from tornado.web import Application, HTTPError, RequestHandler
 
 from pipelines.core.errors import GeorefError, StorageError
+from pipelines.core.json_values import JsonValue
 from pipelines.core.progress import SILENT, Progress
-from pipelines.core.types import JsonValue
 from pipelines.core.workspace import Workspace
 from pipelines.survey.saved_measurements import NamedMeasurement
 from pipelines.view import requests

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 
 from pipelines.core.errors import InputError
+from pipelines.core.json_values import Json
 from pipelines.core.manifest import hash_file
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.stages import GAUSSIANS, MODEL
-from pipelines.core.types import ByteArray, FloatArray, Json
+from pipelines.core.types import ByteArray, FloatArray
 from pipelines.core.workspace import Workspace
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.report.page import limited

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from pipelines.core.errors import GeorefError
-from pipelines.core.types import JsonValue
+from pipelines.core.json_values import JsonValue
 
 log = logging.getLogger(__name__)
 
