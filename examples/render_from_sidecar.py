@@ -68,8 +68,8 @@ def main() -> None:
     number = sfm.image_index()
     registered = [(image, image.fix) for image in survey.images if image.name in number and image.fix is not None]
     chosen = registered[:: max(1, len(registered) // options.images)][: options.images]
-    images = photographs(sfm, survey, workspace, options.size)
-    pinholes = Pinholes(images, sfm.lenses, solution.with_lenses(sfm).lenses)
+    images = photographs(solution.with_lenses(sfm), survey, workspace, options.size)
+    pinholes = Pinholes(images)
     gaussians, backend = read_gaussians(options.splat), rasterizer("auto")
     options.output.mkdir(parents=True, exist_ok=True)
     for image, fix in chosen:

@@ -29,9 +29,9 @@ import shapely
 from scipy.ndimage import map_coordinates
 
 from pipelines.core.products import load_json
-from pipelines.core.types import FloatArray
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.core.workspace import Workspace
-from pipelines.formats.geotiff import raster_frame, read_cells
+from pipelines.formats.geotiff import RasterFrame, raster_frame, read_cells
 from pipelines.formats.vector_files import feature, features_text
 from pipelines.geodesy.crs import parse_crs
 from pipelines.geodesy.enu import ecef_from_enu, ecef_from_lla, enu_from_ecef, lla_from_ecef
@@ -189,7 +189,7 @@ def measured_pair(args: argparse.Namespace, seed: int, folder: Path) -> PairFigu
         false_alarms=float(np.isin(still[still > 0], CHANGED).mean()),
         doubtful=len(change.doubtful),
         regions_of_no_change=len(same.regions),
-        volumes=tuple(_volume_errors(truth, truth.change, change, folder, true_from_seen)),
+        volumes=tuple(_volume_errors(truth, change, folder, true_from_seen, risen)),
         lod_m=change.median_lod_m,
         gsd_m=_ground_sampling_m(Workspace(folder / "first")) or float("nan"),
         stable_shift_m=same.registration.shift_m,
@@ -228,12 +228,8 @@ def _camera_error(folder: Path) -> tuple[float, float, float]:
 def true_difference(truth: Truth, change: TrueChange, folder: Path, true_from_seen: Similarity) -> FloatArray:
     """Return the true later minus earlier height (H, W) in metres of the cells of a comparison; NaN: not known."""
     frame = raster_frame(folder / "changed/change/difference.tif")
-    crs = parse_crs(frame.wkt)
-    column, row = np.meshgrid(np.arange(frame.columns) + 0.5, np.arange(frame.rows) + 0.5)
-    plan = [frame.west + column.ravel() * frame.step_x, frame.north - row.ravel() * frame.step_y]
-    lla = crs.lla_from_xyz(np.column_stack([*plan, np.zeros(column.size)]))
-    lla[:, 2] = truth.origin.alt_m
-    geo = true_from_seen.apply(enu_from_ecef(ecef_from_lla(lla), truth.origin))
+    row, column = np.indices((frame.rows, frame.columns)).reshape(2, -1)
+    geo = _in_geo(truth, frame, row, column, true_from_seen)
     heights = np.load(folder / "survey_changed" / TRUE_HEIGHTS)
     place = [(geo[:, axis] - change.corner[axis]) / change.cell_m - 0.5 for axis in (1, 0)]
     risen = map_coordinates(heights["after"] - heights["before"], place, order=0, cval=np.nan)
@@ -253,17 +249,21 @@ def _true_polygons(truth: Truth, change: TrueChange, seen_from_true: Similarity)
 
 
 def _volume_errors(
-    truth: Truth, change: TrueChange, found: Change, folder: Path, true_from_seen: Similarity
+    truth: Truth, found: Change, folder: Path, true_from_seen: Similarity, risen: FloatArray
 ) -> list[VolumeError]:
-    """Return the volumes of all regions, and the true ones within their outlines."""
+    """Return the volumes of all regions, and the true ones of their cells with a height of both epochs.
+
+    What an epoch has not measured is in no volume, as `known_share` says. `risen` (H, W) is the true difference.
+    """
+    assert truth.change is not None
     regions = json.loads((folder / "changed/change/regions.geojson").read_text("utf-8"))["features"]
-    heights = np.load(folder / "survey_changed" / TRUE_HEIGHTS)
-    risen = heights["after"] - heights["before"]
-    row, column = np.indices(risen.shape) + 0.5
-    east, north = change.corner[0] + column * change.cell_m, change.corner[1] + row * change.cell_m
+    difference = folder / "changed/change/difference.tif"
+    frame, known = raster_frame(difference), np.isfinite(read_cells(difference)[0]) & np.isfinite(risen)
+    row, column = np.nonzero(known)
+    cells = _in_geo(truth, frame, row, column, true_from_seen)
     errors = []
     for one, region in zip(regions, found.regions, strict=True):
-        in_geo = shapely.transform(
+        outline = shapely.transform(
             shapely.geometry.shape(one["geometry"]),
             lambda lon_lat: true_from_seen.apply(
                 enu_from_ecef(
@@ -272,11 +272,22 @@ def _volume_errors(
                 )
             )[:, :2],
         )
-        true_m3 = float(np.nansum(risen[shapely.contains_xy(in_geo, east, north)])) * change.cell_m**2
-        kinds = [each.kind for each in change.regions if shapely.Polygon(each.outline).intersects(in_geo)]
+        inside = shapely.contains_xy(outline, *cells.T)
+        true_m3 = float(risen[row, column][inside].sum()) * found.cell_m**2
+        kinds = [each.kind for each in truth.change.regions if shapely.Polygon(each.outline).intersects(outline)]
         kind = " and ".join(kinds) or "no change"
         errors.append(VolumeError(region.name, kind, region.net_m3, true_m3, region.sigma_m3))
     return errors
+
+
+def _in_geo(
+    truth: Truth, frame: RasterFrame, row: IntArray, column: IntArray, true_from_seen: Similarity
+) -> FloatArray:
+    """Return east and north (K, 2) in the `geo` of the truth of cells of a raster of the first survey."""
+    plan = [frame.west + (column + 0.5) * frame.step_x, frame.north - (row + 0.5) * frame.step_y]
+    lla = parse_crs(frame.wkt).lla_from_xyz(np.column_stack([*plan, np.zeros(len(row))]))
+    lla[:, 2] = truth.origin.alt_m
+    return true_from_seen.apply(enu_from_ecef(ecef_from_lla(lla), truth.origin))[:, :2]
 
 
 def _georef(*words: object) -> None:

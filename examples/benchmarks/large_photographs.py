@@ -22,7 +22,7 @@ from pipelines.splat.memory import predicted_peak_bytes
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.photographs import ImageCache, Photograph
-from pipelines.survey.scene import SparseScene, load_adjusted_scene
+from pipelines.survey.scene import SparseScene, load_solved_scene
 from pipelines.survey.solution import Solution
 from pipelines.train.estimate import training_size
 from pipelines.train.georeference.problem import frozen_problem
@@ -35,8 +35,8 @@ from pipelines.train.trainer import make_trainer
 def enlarged(
     workspace: Workspace, scratch: Path, count: int, size_px: int
 ) -> tuple[Solution, SparseScene, list[Photograph]]:
-    """Solution and scene of the first training photographs, enlarged, under SfM's lens, and their files."""
-    solution, survey, whole = load_adjusted_scene(workspace)
+    """Solution and scene of the first training photographs, enlarged, and their files."""
+    solution, survey, whole = load_solved_scene(workspace)
     first = whole.train[:count]
     scene, solution = whole.of_images(first), solution.of_images(first).model_copy(update={"lenses": ()})
     folder = photograph_folder(workspace, survey.image_dir)

@@ -50,7 +50,7 @@ from pipelines.surface.surface_views import model_renderer
 from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CloudCrs
 from pipelines.survey.report import read_report
-from pipelines.survey.scene import load_adjusted_scene, photographs
+from pipelines.survey.scene import load_solved_scene, photographs
 from pipelines.survey.solution import read_sfm, read_trained
 from pipelines.train.lidar import compared_lidar, lidar_surface, registration_of
 from pipelines.train.options import TrainOptions
@@ -223,7 +223,7 @@ def comparison(
     manifest = workspace.manifest(BY_NAME["train"])
     assert manifest is not None
     options = TrainOptions.model_validate(manifest.config)
-    solution, survey, scene = load_adjusted_scene(workspace)
+    solution, survey, scene = load_solved_scene(workspace)
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     images.build(SILENT)
     maps, files = DepthMaps(workspace.cache / "surface", scene, images), measured_files(options, scene)

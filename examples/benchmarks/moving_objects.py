@@ -21,7 +21,7 @@ from pipelines.core.types import BoolArray, ByteArray
 from pipelines.core.workspace import Workspace
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.survey.photographs import ImageCache, save_array
-from pipelines.survey.scene import SparseScene, load_adjusted_scene
+from pipelines.survey.scene import SparseScene, load_solved_scene
 from pipelines.train.options import TrainOptions
 from pipelines.train.trainer import JointTrainer
 
@@ -92,7 +92,7 @@ def main() -> None:
                 seed=arguments.seed,
             )
             if painted is None:
-                _, survey, scene = load_adjusted_scene(Workspace(root))
+                _, survey, scene = load_solved_scene(Workspace(root))
                 images = undistorted(root, scene, survey, options)
                 painted = paint(scene, images, arguments, write=objects)
             trainer, scene, images = trainer_on(root, options)

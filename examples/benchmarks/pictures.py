@@ -149,8 +149,8 @@ class _Photographs:
 
     def __init__(self, workspace: Workspace, model: TrainedModel, sfm: SparseModel, survey: Survey) -> None:
         largest = max(max(camera.width, camera.height) for camera in sfm.cameras.values())
-        self._model, self._images = model, photographs(sfm, survey, workspace, largest)
-        self._pinholes = Pinholes(self._images, sfm.lenses, model.with_lenses(sfm).lenses)
+        self._model, self._images = model, photographs(model.with_lenses(sfm), survey, workspace, largest)
+        self._pinholes = Pinholes(self._images)
 
     def steepest(
         self, place: FloatArray, cell_m: float, shape: tuple[int, int], hidden: Callable[[FloatArray], bool]

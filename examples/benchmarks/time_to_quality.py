@@ -136,14 +136,15 @@ def measured(workspace: Workspace, age_s: dict[Path, float]) -> list[Row]:
     # Gaussians come from the checkpoints: the stereo that only places the first ones is not repeated.
     options = TrainOptions.model_validate({**manifest.config, "dense": False})
     (started, survey, scene), backend = load_adjusted_scene(workspace), rasterizer(options.backend)
-    images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
+    solved = scene.at(started)
+    images = photographs(solved.sparse, survey, workspace, options.effort.max_image_size)
     observed = measured_problem(started, survey, scene, control_points=options.gcp_loss)
     refines, points = options.refined_cameras(len(images)) > 0, GeolocatedPoints.load(workspace.path(POINTS))
     problem = frozen_problem(started, scene)
     if refines:
         posterior = posterior_of(workspace, started, scene.sparse)
         problem = refining_problem(posterior, survey, scene, observed, options, points=points, seed=options.seed)
-    trainer = make_trainer(TrainingScene(scene, images), problem, backend, options)
+    trainer = make_trainer(TrainingScene(solved, images), problem, backend, options)
     rows: list[Row] = []
     for path, seconds in age_s.items():
         trainer.restore(load_checkpoint(path))

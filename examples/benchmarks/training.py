@@ -115,16 +115,17 @@ def undistorted(root: Path, scene: SparseScene, survey: Survey, options: TrainOp
 
 def trainer_on(root: Path, options: TrainOptions) -> tuple[JointTrainer, SparseScene, ImageCache]:
     """Trainer before its first iteration, on a workspace with init-sim3 done, as `georef train` makes it."""
-    solution, survey, scene = load_adjusted_scene(Workspace(root))
+    solution, survey, adjusted = load_adjusted_scene(Workspace(root))
+    scene = adjusted.at(solution)
     images = undistorted(root, scene, survey, options)
-    measured = measured_problem(solution, survey, scene, control_points=options.gcp_loss)
+    measured = measured_problem(solution, survey, adjusted, control_points=options.gcp_loss)
     maps = DepthMaps(Workspace(root).cache / "surface", scene, images)
     maps.build()
     problem = frozen_problem(solution, scene)
     if options.refined_cameras(len(images)):
-        posterior = posterior_of(Workspace(root), solution, scene.sparse)
+        posterior = posterior_of(Workspace(root), solution, adjusted.sparse)
         points = GeolocatedPoints.load(Workspace(root).path(POINTS))
-        problem = refining_problem(posterior, survey, scene, measured, options, points=points, seed=options.seed)
+        problem = refining_problem(posterior, survey, adjusted, measured, options, points=points, seed=options.seed)
     trainer = make_trainer(
         TrainingScene(scene, images, SceneSurface(maps)),
         problem,

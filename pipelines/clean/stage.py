@@ -45,7 +45,7 @@ from pipelines.surface.photometry import mean_psnr
 from pipelines.surface.surface_views import ModelRenderer, model_renderer
 from pipelines.survey.navigation import load_survey
 from pipelines.survey.photographs import save_array
-from pipelines.survey.scene import load_adjusted_scene, photographs
+from pipelines.survey.scene import load_solved_scene, photographs
 from pipelines.survey.solution import Solution, read_sfm, read_trained
 
 # Reasons for which a Gaussian went, by their number in `reason.npy`; 0: it stays.
@@ -200,8 +200,8 @@ def _floating(before: BoolArray, alone: BoolArray, doubtful: BoolArray) -> BoolA
 
 def _measured(workspace: Workspace, progress: Progress) -> Iterator[MeasuredView]:
     """Yield the depth maps of the training photographs, which training has left in the cache or are made again."""
-    _, survey, scene = load_adjusted_scene(workspace)
     model = read_trained(workspace)
+    _, survey, scene = load_solved_scene(workspace)
     maps = DepthMaps(
         workspace.cache / "surface", scene, photographs(scene.sparse, survey, workspace, model.max_image_size)
     )

@@ -193,14 +193,12 @@ class PhotoColours:
 
     def __init__(
         self,
-        model: TrainedModel,
-        sfm: SparseModel,
         source: RasterSource,
         images: ImageCache,
         pictures: Pictures,
     ) -> None:
         self._source, self._images, self._pictures = source, images, pictures
-        self._pinholes = Pinholes(images, sfm.lenses, model.with_lenses(sfm).lenses)
+        self._pinholes = Pinholes(images)
         self._views: dict[int, _View] = {}
 
     def window(self, frame: RasterFrame, first: tuple[int, int], height: FloatArray) -> CellColours:

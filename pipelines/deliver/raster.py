@@ -153,15 +153,15 @@ def _colour(
     """Colour the orthophoto by the photographs, and on request its bands; keep on request what cells are from."""
     model, sfm = renderer.model, renderer.sfm
     longest_px = max(max(camera.width, camera.height) for camera in sfm.cameras.values())
-    images = photographs(sfm, survey, stage.workspace, longest_px)
+    images = photographs(model.with_lenses(sfm), survey, stage.workspace, longest_px)
     if options.colours == "photographs":
-        colours = PhotoColours(model, sfm, source, images, ColourPictures(model, sfm, source, images))
+        colours = PhotoColours(source, images, ColourPictures(model, sfm, source, images))
         mosaic.colour(colours, stage.progress)
         if options.source:
             mosaic.add_source()
             replace_text(stage.out / "source.json", json.dumps(["", *sfm.image_name], indent=1))
     if bands is not None:
-        mosaic.add_bands(PhotoColours(model, sfm, source, images, bands), bands.bands, stage.progress)
+        mosaic.add_bands(PhotoColours(source, images, bands), bands.bands, stage.progress)
 
 
 def _sidecar(

@@ -75,7 +75,7 @@ class ModelRenderer:
         self.model, self.gaussians, self.images, self.backend = model, gaussians, images, backend
         self.sfm, self.sparse = sfm, model.with_lenses(sfm)
         self.poses, self.geo_from_model = model.poses, model.similarity
-        self.pinholes = Pinholes(images, sfm.lenses, self.sparse.lenses)
+        self.pinholes = Pinholes(images)
         self._on_device = gaussians.to(backend.device)
 
     def showing(self, gaussians: Gaussians) -> "ModelRenderer":
@@ -157,7 +157,7 @@ def model_renderer(
     The undistorted photographs are built by whoever needs them all.
     """
     gaussians = read_gaussians(workspace.path(GAUSSIANS))
-    images = photographs(sfm, survey, workspace, model.max_image_size)
+    images = photographs(model.with_lenses(sfm), survey, workspace, model.max_image_size)
     return ModelRenderer(model, sfm, gaussians, images, rasterizer(backend, progress, mip_filter=model.mip_filter))
 
 

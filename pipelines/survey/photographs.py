@@ -420,12 +420,12 @@ def _sources(camera: Camera, pinhole: Pinhole, u: FloatArray, v: FloatArray) -> 
 class Pinholes:
     """Pinhole of each image, which maps the rays of the present lens to pixels of the undistorted photograph.
 
-    Photographs are undistorted once, with the lenses `sfm`. A change of the lens, at first to `now`, is expressed
-    as another pinhole (`geometry.cameras`); without `sfm`, the lenses never change.
+    Photographs are undistorted once, with the lenses `first`. A later change of the lens is expressed as another
+    pinhole (`geometry.cameras`); without `first`, the lenses never change.
     """
 
-    def __init__(self, images: ImageCache, sfm: Lenses | None = None, now: Lenses | None = None) -> None:
-        self._images, self._sfm, self._now = images, sfm, sfm if now is None else now
+    def __init__(self, images: ImageCache, first: Lenses | None = None) -> None:
+        self._images, self._first, self._now = images, first, first
         self._fitted: dict[int, Pinhole] = {}
 
     def renew(self, now: Lenses) -> None:
@@ -434,11 +434,11 @@ class Pinholes:
 
     def of(self, index: int) -> Pinhole:
         """Return the camera of an image, at the size of the undistorted photographs."""
-        if self._sfm is None or self._now is None:
+        if self._first is None or self._now is None:
             return self._images.pinhole(index)
-        key = int(self._sfm.camera_id[index])  # Photographs of one camera share a pinhole.
+        key = int(self._first.camera_id[index])  # Photographs of one camera share a pinhole.
         if key not in self._fitted:
-            before, after = self._sfm.of(index), self._now.of(index)
+            before, after = self._first.of(index), self._now.of(index)
             self._fitted[key] = refit_pinhole(self._images.pinhole(index), before, after)
         return self._fitted[key]
 

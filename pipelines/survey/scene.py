@@ -20,6 +20,7 @@ from pipelines.core.workspace import Workspace
 from pipelines.formats.colmap import read_sparse
 from pipelines.geometry.bundle import BundleInformation, bundle_information
 from pipelines.geometry.cameras import CameraPoses
+from pipelines.geometry.intersection import refined_points
 from pipelines.geometry.network import Network
 from pipelines.geometry.rolling_shutter import depths_at, in_rolling_shutter
 from pipelines.geometry.similarity import Similarity
@@ -62,6 +63,25 @@ class SparseScene:
     def point_in_model(self) -> FloatArray:
         """Points of the SfM model (N, 3), metres in `model`."""
         return self.model_from_local.apply(self.sparse.point_in_local)
+
+    def at(self, solution: Solution) -> SparseScene:
+        """Return the scene as a solution has it: with its cameras and lenses, and the points that they see.
+
+        SfM's own cameras are the place at which the adjustment is linear. What photographs show, such as stereo,
+        belongs to the solved ones: else it has the bend of SfM's model, which the adjustment removes.
+        """
+        poses, sparse = solution.poses, solution.with_lenses(self.sparse)
+        local_from_model, turn = self.model_from_local.inverse(), self.model_from_local.rotation
+        refined = refined_points(network_of(sparse, poses, self.point_in_model))
+        rotation, center = poses.cam_from_model @ turn, local_from_model.apply(poses.cam_center_in_model)
+        solved = replace(
+            sparse,
+            rotation_cam_from_local=rotation,
+            translation_cam_from_local=-np.einsum("nij,nj->ni", rotation, center),
+            point_in_local=local_from_model.apply(refined.point_in_world),
+            point_error_px=refined.error_px,
+        )
+        return replace(self, sparse=solved, known_bundle=None)
 
     def geo_from_local(self, geo_from_model: Similarity) -> Similarity:
         """Return a similarity of the model as one of the SfM frame."""
@@ -141,6 +161,12 @@ def load_adjusted_scene(workspace: Workspace, product: str = ADJUSTMENT) -> tupl
     adjustment = read_solution(workspace, product)
     survey = adjustment.weighted(load_survey(workspace))
     return adjustment, survey, adjusted_scene(read_sparse(workspace.path(SPARSE)), survey, adjustment)
+
+
+def load_solved_scene(workspace: Workspace, product: str = ADJUSTMENT) -> tuple[Solution, Survey, SparseScene]:
+    """Read what `load_adjusted_scene` reads, and return the scene at the solution (`SparseScene.at`)."""
+    solution, survey, scene = load_adjusted_scene(workspace, product)
+    return solution, survey, scene.at(solution)
 
 
 def photographs(sparse: SparseModel, survey: Survey, workspace: Workspace, max_size_px: int) -> ImageCache:

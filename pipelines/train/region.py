@@ -16,12 +16,11 @@ import torch
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole, pose_matrix
-from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.gaussians import Gaussians
 from pipelines.splat.rasterizer.api import Rasterizer, RasterSettings, Window
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.block_plan import BlockCell
-from pipelines.survey.photographs import ImageCache, Pinholes
+from pipelines.survey.photographs import ImageCache
 from pipelines.survey.solution import Solution
 
 _STAND_IN_PX = 160  # longest side of the stand-in's renders
@@ -99,7 +98,6 @@ class TrainingRegion:
 
 def region_masks(
     solution: Solution,
-    sparse: SparseModel,
     views: IntArray,
     images: ImageCache,
     rasterizer: Rasterizer,
@@ -111,14 +109,14 @@ def region_masks(
 ) -> RegionMasks:
     """Return the pixels of the views (T,) of cameras whose surface lies in a region, the cell.
 
-    `sparse` has the lenses of SfM. The depth of the stand-in counts where the maps, if there are any, know none.
+    The images were undistorted with the lenses of the solution. Where the maps, if any, know no depth, that of the
+    stand-in counts.
     """
     poses = solution.poses
-    pinholes = Pinholes(images, sparse.lenses, solution.with_lenses(sparse).lenses)
     masks: dict[int, BoolArray] = {}
     with progress.task("masks", len(views)) as task:
         for index in views.tolist():
-            pinhole = pinholes.of(index)
+            pinhole = images.pinhole(index)
             pose = pose_matrix(poses.cam_from_model[index], poses.cam_center_in_model[index])
             depth = stand_in_depth(stand_in, pose, pinhole, rasterizer)
             masks[index] = region_mask(pose, pinhole, cell, None if maps is None else maps.depth(index), depth)

@@ -73,15 +73,16 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     backend = rasterizer(options.backend, stage.progress, mip_filter=options.mip_filter)
     workspace = stage.workspace
     (solution, survey, scene), path = load_adjusted_scene(workspace), options.lidar_trajectory
-    clouds = measured_files(options, scene)
+    solved = scene.at(solution)
+    clouds = measured_files(options, solved)
     track = None if path is None else ScannerTrack.read(path, _stated_crs(options), survey.origin_on_earth)
-    images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
+    images = photographs(solved.sparse, survey, workspace, options.effort.max_image_size)
     options = _within_memory(options, images, free_memory_bytes(backend.device))
     images.build(stage.progress)
     compile_kernels(stage.progress, renders=backend.name == "cpu")
     surface, compared, planes, lidar = None, None, None, None
     if options.dense:
-        maps = DepthMaps(workspace.cache / "surface", scene, images)
+        maps = DepthMaps(workspace.cache / "surface", solved, images)
         maps.build(stage.progress)
         surface = SceneSurface(maps)
         if clouds is not None:
@@ -110,11 +111,11 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         lidar = lidar_surface(compared, clouds, survey, options, shift_m)
         surface = lidar.surface
         save_json(lidar.report, stage.out / Path(LIDAR).name)
-        draw_changes(stage.out / Path(LIDAR_MAP).name, lidar, scene)
+        draw_changes(stage.out / Path(LIDAR_MAP).name, lidar, solved)
         if lidar.held_out is not None:
             save_npz(stage.out / Path(HELD_OUT).name, vars(lidar.held_out))
-    area = boundary_area(options, scene.geo_from_model.apply(scene.point_in_model), survey.origin)
-    trainer = make_trainer(TrainingScene(scene, images, surface, area=area), problem, backend, options)
+    area = boundary_area(options, solved.geo_from_model.apply(solved.point_in_model), survey.origin)
+    trainer = make_trainer(TrainingScene(solved, images, surface, area=area), problem, backend, options)
     done = 0 if stage.extends is None else load_json(TrainedModel, stage.extends / Path(MODEL).name).iterations
     record = train_in_folder(stage, trainer, options, done)
     if refines:

@@ -115,7 +115,7 @@ class JointTrainer:
         self.schedule = TrainingSchedule(options, views.camera)
         self.device = optimizer.gaussians.means.device
         self.pinholes = Pinholes(views.images, views.lenses)
-        self._lens = np.zeros(len(problem.unknowns.lens()))
+        self._lens = self._undistorted_with = self.problem.unknowns.lens().detach().cpu().numpy().copy()
         masks = None if region is None else region.masks
         self._targets = TargetImages(views.images, self.pinholes, self.device, masks, options.crops)
         self._losses = training_losses(
@@ -207,10 +207,10 @@ class JointTrainer:
         return ImageLook(index, shrink, self.schedule.visit(iteration))
 
     def _use_lens(self, lens: np.ndarray) -> None:
-        """Render from now on through SfM's lenses with a change (L,) of their parameters."""
+        """Render from now on through the lenses that differ by (L,) from SfM's."""
         self._lens = lens.copy()
         if self.views.lenses is not None and len(lens):
-            self.pinholes.renew(self.views.lenses.moved(self._lens))
+            self.pinholes.renew(self.views.lenses.moved(self._lens - self._undistorted_with))
 
     def _rendered(self, target: TargetImage) -> RenderedView:
         """Return the view of this iteration, with all that its losses need."""

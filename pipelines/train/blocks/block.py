@@ -23,7 +23,7 @@ from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.surface.depth_maps import DepthMaps
 from pipelines.survey.area import boundary_area
 from pipelines.survey.block_plan import BlockPlan, BlockTraining, PlannedBlock
-from pipelines.survey.scene import load_adjusted_scene, photographs
+from pipelines.survey.scene import load_solved_scene, photographs
 from pipelines.train.estimate import training_size
 from pipelines.train.georeference.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
@@ -42,7 +42,7 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
     """Train the block, and return its figures; errors as of `train.stage.run`, or too few photographs show it."""
     backend, workspace = rasterizer(options.backend, mip_filter=options.mip_filter), stage.workspace
     block = load_json(BlockPlan, workspace.path(BLOCK_PLAN)).block(options.id)
-    solution, survey, whole = load_adjusted_scene(workspace, SOLUTION)
+    solution, survey, whole = load_solved_scene(workspace, SOLUTION)
     box = SceneBox.around(whole.point_in_model)
     index = whole.sparse.image_index()
     rows = np.array([index[name] for name in block.cameras if name in index], dtype=np.int64)
@@ -64,7 +64,6 @@ def run(stage: StageRun, options: BlockTrainOptions) -> Summary:
         maps.build(stage.progress)
     masks = region_masks(
         solution,
-        scene.sparse,
         scene.train,
         images,
         backend,

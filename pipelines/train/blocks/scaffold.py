@@ -10,7 +10,7 @@ from pipelines.splat.gaussians import write_gaussians
 from pipelines.splat.memory import free_memory_bytes, require_memory
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.survey.block_plan import SCAFFOLD_IMAGE_PX, scaffold_gaussians
-from pipelines.survey.scene import load_adjusted_scene, photographs
+from pipelines.survey.scene import load_solved_scene, photographs
 from pipelines.train.estimate import training_size
 from pipelines.train.georeference.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
@@ -26,7 +26,7 @@ _MOST_ITERATIONS, _MOST_LOOKS = 3_000, 10_000
 def run(stage: StageRun, options: TrainOptions) -> Summary:
     """Train the scaffold, and return its key figures; errors are those of `train.stage.run`."""
     backend, workspace = rasterizer(options.backend, mip_filter=options.mip_filter), stage.workspace
-    solution, survey, scene = load_adjusted_scene(workspace, SOLUTION)
+    solution, survey, scene = load_solved_scene(workspace, SOLUTION)
     coarse = coarse_options(options, len(scene.train))
     images = photographs(scene.sparse, survey, workspace, coarse.effort.max_image_size)
     require_memory(training_size(coarse, len(images), images.largest()), free_memory_bytes(backend.device))

@@ -27,7 +27,7 @@ from pipelines.splat.rasterizer.api import Rasterizer
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.survey.block_plan import BlockCell, BlockPlan, PlannedBlock
 from pipelines.survey.photographs import ImageCache
-from pipelines.survey.scene import SparseScene, load_adjusted_scene, photographs
+from pipelines.survey.scene import SparseScene, load_solved_scene, photographs
 from pipelines.survey.solution import Solution
 from pipelines.train.georeference.problem import frozen_problem
 from pipelines.train.initial_gaussians import TrainingScene
@@ -50,7 +50,7 @@ def run(stage: StageRun, options: SeamOptions) -> Summary:
         stage.out / _DONE,
     )
     plan = load_json(BlockPlan, workspace.path(BLOCK_PLAN))
-    solution, survey, scene = load_adjusted_scene(workspace, SOLUTION)
+    solution, survey, scene = load_solved_scene(workspace, SOLUTION)
     images = photographs(scene.sparse, survey, workspace, options.effort.max_image_size)
     if not stage.resumed or not done.is_file():
         for block in plan.blocks:
@@ -146,9 +146,7 @@ class _SeamTrainer:
         index = scene.sparse.image_index()
         train = np.array([index[name] for name in names if name in index], dtype=np.int64)
         everything = Gaussians.concatenate([start, surroundings]).to(device)
-        masks = region_masks(
-            self.solution, scene.sparse, train, self.images, self.backend, cell=strip, stand_in=everything
-        )
+        masks = region_masks(self.solution, train, self.images, self.backend, cell=strip, stand_in=everything)
         seeing = masks.seeing
         if len(seeing) < _LEAST_VIEWS:
             return None

@@ -5,7 +5,7 @@ Reads the survey, the SfM model and the adjustment. Writes `solution.json`.
 
 from pipelines.core.products import save_json
 from pipelines.core.workspace import StageRun, Summary
-from pipelines.survey.scene import load_adjusted_scene, photographs
+from pipelines.survey.scene import load_solved_scene, photographs
 from pipelines.train.options import SolutionOptions
 from pipelines.train.solution_state import with_exposures
 from pipelines.train.track_exposures import exposures_from_tracks
@@ -14,7 +14,7 @@ from pipelines.train.track_exposures import exposures_from_tracks
 def run(stage: StageRun, options: SolutionOptions) -> Summary:
     """Write the solution, and return its key figures; raises a `GeorefError` if something cannot be read."""
     workspace = stage.workspace
-    solution, survey, scene = load_adjusted_scene(workspace)
+    solution, survey, scene = load_solved_scene(workspace)
     if options.exposure:
         images = photographs(scene.sparse, survey, workspace, options.max_image_size)
         images.build(stage.progress)
