@@ -8,7 +8,7 @@ errors, and that of the whole exceeds 1.96 σ.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -180,9 +180,9 @@ def find_regions(
 
 
 def without_doubtful(
-    found: FoundRegions, doubtful: Collection[int], reason: str, noise: Noise, cell_m2: float
+    found: FoundRegions, doubtful: Mapping[int, str], noise: Noise, cell_m2: float
 ) -> tuple[FoundRegions, DoubtfulRegions]:
-    """Return the regions that count, and those at some places of `found`, which do not, for a reason."""
+    """Return the regions that count, and those at some places of `found`, which do not, each for a reason."""
     out = sorted(doubtful)
     kept = [index for index in range(len(found.regions)) if index not in doubtful]
     moved = np.zeros(len(found.regions) + 1, dtype=np.int32)
@@ -198,7 +198,7 @@ def without_doubtful(
         cell_m2=cell_m2,
     )
     regions = tuple(
-        DoubtfulRegion(**found.regions[index].model_dump() | {"name": f"D{rank}"}, reason=reason)
+        DoubtfulRegion(**found.regions[index].model_dump() | {"name": f"D{rank}"}, reason=doubtful[index])
         for rank, index in enumerate(out, start=1)
     )
     return remaining, DoubtfulRegions(regions, [found.polygons[index] for index in out], inside)

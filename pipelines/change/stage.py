@@ -33,6 +33,7 @@ from pipelines.change.grid import (
     epoch_rasters,
 )
 from pipelines.change.options import ChangeOptions
+from pipelines.change.own_points import contradicted_by_own_points
 from pipelines.change.page import Compared, change_page
 from pipelines.change.regions import (
     DoubtfulRegions,
@@ -65,7 +66,12 @@ _PLACES = 20  # along each side of the rasters, which stand for the survey
 _ROOM = __name__.rpartition(".")[0]
 _MOST_LEVELS = 1_000_000  # of detection, whose median is stated
 _MOST_TWICE = 0.5  # of the photographs of an epoch: more are one flight
-DOUBTED = "region-contradicted"  # reason of doubtful regions, and code of their warning
+# Reasons of doubtful regions, and codes of their warnings: by points in common, and by a date's own tie points.
+DOUBTED, OFF_POINTS = "region-contradicted", "surface-contradicted"
+_WHY = {
+    DOUBTED: "points in common lie where they lay at the other date, although the surfaces differ there",
+    OFF_POINTS: "a surface lies beside the tie points of its own photographs there",
+}
 _KINDS = {
     "difference": RasterKind("float32", (Band("later minus earlier height", "metre"),)),
     "sigma": RasterKind("float32", (Band("standard deviation of the difference", "metre"),)),
@@ -145,7 +151,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     remove(parts.folder)
     cautions = tuple(one.cautions for one in epochs)
     stale = tuple(remark for one in workspaces for remark in _stale_rasters(one))
-    of_regions = (*_doubted(change, found, doubtful, partly), *_partly_known(found))
+    of_regions = (*_doubted(found, doubtful, partly), *_partly_known(found))
     warnings = (*stale, *twice, *solved_again, *left_out, *of_regions)
     summary = _summary(change, warnings, union(*cautions))
     compared = Compared(stage.out, change, found.polygons, grid, workspaces, tied, doubtful.polygons)
@@ -322,36 +328,43 @@ def _write_mosaic(folder: Path, parts: RasterParts, name: str) -> None:
 def _counted(
     found: FoundRegions, tied: Tied | None, noise: Noise, parts: RasterParts
 ) -> tuple[FoundRegions, DoubtfulRegions, list[str]]:
-    """Return the regions that count, those that points in common contradict, and the names of those in a part."""
+    """Return the regions that count, those that points contradict, and the names of those in a part."""
     contradicts, grid = Contradicted(), parts.grid
+    by_own = (
+        () if grid.rasters[0].of == "terrain" else contradicted_by_own_points(grid, found.regions, found.polygons)
+    )
     if tied is not None:
         risen_m = partial(sampled_raster, parts.folder.parent / "difference.tif")
         surfaces = Surfaces(grid.crs, risen_m, noise.length_m)
         contradicts = contradicted(tied, found.regions, found.polygons, surfaces)
-    kept = [index for index in range(len(found.regions)) if index not in contradicts.whole]
-    remaining, doubtful = without_doubtful(found, contradicts.whole, DOUBTED, noise, grid.cell_m2)
+    reasons = dict.fromkeys(by_own, OFF_POINTS) | dict.fromkeys(contradicts.whole, DOUBTED)
+    kept = [index for index in range(len(found.regions)) if index not in reasons]
+    remaining, doubtful = without_doubtful(found, reasons, noise, grid.cell_m2)
     partly = [one.name for one, index in zip(remaining.regions, kept, strict=True) if index in contradicts.part]
     return remaining, doubtful, partly
 
 
-def _doubted(change: Change, found: FoundRegions, doubtful: DoubtfulRegions, partly: list[str]) -> Iterator[Remark]:
-    """Yield the warnings of regions that points in common contradict as a whole, or in a part."""
-    if doubtful.regions:
-        names = [region.name for region in doubtful.regions]
+def _doubted(found: FoundRegions, doubtful: DoubtfulRegions, partly: list[str]) -> Iterator[Remark]:
+    """Yield the warnings of regions that points contradict as a whole, or in a part."""
+    for reason, why in _WHY.items():
+        of_reason = [index for index, region in enumerate(doubtful.regions) if region.reason == reason]
+        if not of_reason:
+            continue
+        names = [doubtful.regions[index].name for index in of_reason]
+        net_m3 = sum(doubtful.regions[index].net_m3 for index in of_reason)
+        area = shapely.union_all([doubtful.polygons[index] for index in of_reason])
         given = [
             region.name
             for region, polygon in zip(found.regions, found.polygons, strict=True)
-            if region.name.startswith("P") and shapely.union_all(doubtful.polygons).intersects(polygon)
+            if region.name.startswith("P") and area.intersects(polygon)
         ]
-        net_m3 = sum(region.net_m3 for region in doubtful.regions)
         sentence = (
-            f"{listed(names)} of {net_m3:+.1f} m³, {change.doubtful_share:.0%} of the cells that differ, are "
-            "doubtful and count as no change: points in common lie where they lay at the other date, although the "
-            "surfaces differ there. One of both surfaces is wrong. Compare the photographs."
+            f"{listed(names)} of {net_m3:+.1f} m³ {'is' if len(names) == 1 else 'are'} doubtful and counted as no "
+            f"change: {why}. One of both surfaces is wrong. Compare the photographs."
         )
         if given:
             sentence += f" The volumes of {listed(given)} count a part of it."
-        yield Remark(code=DOUBTED, sentence=sentence)
+        yield Remark(code=reason, sentence=sentence)
     if partly:
         sentence = (
             f"In a part of {listed(partly)}, points in common lie where they lay at the other date, although the "
