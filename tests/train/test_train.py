@@ -18,8 +18,18 @@ from pipelines.adjust.options import InitSim3Options
 from pipelines.core.errors import BackendUnavailableError, DegenerateGeometryError, MissingProductError
 from pipelines.core.products import load_json, save_json
 from pipelines.core.runner import run_stage
-from pipelines.core.stages import ADJUSTMENT, BY_NAME, GAUSSIANS, MODEL, SIM3_POSTERIOR, SURVEY, TRAIN_POSTERIOR
+from pipelines.core.stages import (
+    ADJUSTMENT,
+    BY_NAME,
+    GAUSSIANS,
+    MODEL,
+    SIM3_POSTERIOR,
+    SPARSE,
+    SURVEY,
+    TRAIN_POSTERIOR,
+)
 from pipelines.core.workspace import Workspace
+from pipelines.formats.colmap import read_sparse, write_sparse
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.rotations import log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
@@ -32,7 +42,7 @@ from pipelines.survey.survey import Survey
 from pipelines.train.options import PRESETS, RUN_MINUTES, Preset, TrainOptions
 from tests.refusals import logged_codes, numbers, refused, said
 from tests.scenes import GEO_FROM_LOCAL
-from tests.splat_scenes import TRAINING, RenderedFlight, adjust_workspace
+from tests.splat_scenes import TRAINING, RenderedFlight, adjust_workspace, ground_height
 from tests.threads import single_thread
 from tests.trained_workspaces import load_adjustment
 
@@ -231,6 +241,26 @@ def test_cameras_can_be_frozen(flights: list[RenderedFlight]) -> None:
     workspace = flights[0].workspace("frozen")
     run_stage(workspace, TRAIN, {**SHORT, "iterations": 4, "georeference": "frozen"})
     assert_kept(workspace)
+
+
+def test_surface_is_that_of_the_adjusted_cameras(flights: list[RenderedFlight]) -> None:
+    """SfM's model is bent as by a wrong lens, to 1.2 m at 20 m; the adjustment is not, and so no product may be."""
+    workspace = flights[0].workspace("bent")
+    sparse = read_sparse(workspace.path(SPARSE))
+    geo = GEO_FROM_LOCAL.apply(sparse.point_in_local)
+    geo[:, 2] += 1.2 * (geo[:, :2] ** 2).sum(axis=1) / 20.0**2
+    cameras = {
+        key: replace(lens, params=lens.params * [1.02, 1.02, 1.0, 1.0]) for key, lens in sparse.cameras.items()
+    }
+    bent = replace(sparse, point_in_local=GEO_FROM_LOCAL.inverse().apply(geo), cameras=cameras)
+    write_sparse(bent, workspace.path(SPARSE))
+    run_stage(workspace, TRAIN, {"iterations": 100, "sh_degree": 0})
+    model = load_json(TrainedModel, workspace.path(MODEL))
+    place = model.similarity.apply(read_gaussians(workspace.path(GAUSSIANS)).means.double().numpy())
+    off_m, distance_m = place[:, 2] - ground_height(place[:, 0], place[:, 1]), np.linalg.norm(place[:, :2], axis=1)
+    # A quarter of a pixel is 0.25 m of height.
+    assert abs(np.median(off_m[distance_m < 10])) < 0.25
+    assert abs(np.median(off_m[(distance_m > 17) & (distance_m < 23)])) < 0.25
 
 
 def test_a_workspace_without_adjustment_is_told_which_stage_makes_it(flights: list[RenderedFlight]) -> None:
