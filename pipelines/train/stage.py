@@ -37,6 +37,7 @@ from pipelines.survey.options import CloudCrs
 from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import SparseScene, load_adjusted_scene, photographs
 from pipelines.survey.solution import GeolocatedPoints, LensVignetting, Solution, TrainedModel
+from pipelines.survey.survey import Survey
 from pipelines.train.compilation import compile_kernels
 from pipelines.train.estimate import estimate_training, training_size, with_effort
 from pipelines.train.georeference.problem import frozen_problem, refining_problem
@@ -73,10 +74,9 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     backend = rasterizer(options.backend, stage.progress, mip_filter=options.mip_filter)
     workspace = stage.workspace
     (solution, survey, scene), path = load_adjusted_scene(workspace), options.lidar_trajectory
-    solved = scene.at(solution)
+    solved, images = _seen_by(workspace, scene, survey, solution, options)
     clouds = measured_files(options, solved)
     track = None if path is None else ScannerTrack.read(path, _stated_crs(options), survey.origin_on_earth)
-    images = photographs(solved.sparse, survey, workspace, options.effort.max_image_size)
     options = _within_memory(options, images, free_memory_bytes(backend.device))
     images.build(stage.progress)
     compile_kernels(stage.progress, renders=backend.name == "cpu")
@@ -98,11 +98,15 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
         minimum = minimise(measured, state_of(solution, scene, measured.errors))
         posterior = solved_at(solution, survey, scene, measured, minimum.state)
         solution = posterior.solution
+        solved, images = _seen_by(workspace, scene, survey, solution, options)
+        images.build(stage.progress)
     refines = options.refined_cameras(len(images)) > 0
     if refines:
         start = posterior or load_posterior(workspace.path(SIM3_POSTERIOR), solution, scene.sparse)
-        points = GeolocatedPoints.load(workspace.path(POINTS))
-        problem = refining_problem(start, survey, scene, measured, options, points=points, seed=options.seed)
+        problem = refining_problem(
+            start, survey, scene, measured, options,
+            points=GeolocatedPoints.load(workspace.path(POINTS)), seed=options.seed,
+        )  # fmt: skip
     else:
         log.info("Similarity and cameras are frozen at the adjustment of init-sim3.")
         problem = frozen_problem(solution, scene)
@@ -123,6 +127,14 @@ def run(stage: StageRun, options: TrainOptions) -> Summary:
     model = _write_solution(stage, trainer, solution, posterior)
     metrics = [json.loads(row) for row in (stage.out / METRICS).read_text(encoding="utf-8").splitlines()]
     return _summary(model, metrics, record, None if lidar is None else lidar.report)
+
+
+def _seen_by(
+    workspace: Workspace, scene: SparseScene, survey: Survey, solution: Solution, options: TrainOptions
+) -> tuple[SparseScene, ImageCache]:
+    """Return the scene at a solution, and its photographs, undistorted with the solved lenses but not yet built."""
+    solved = scene.at(solution)
+    return solved, photographs(solved.sparse, survey, workspace, options.effort.max_image_size)
 
 
 def measured_files(options: TrainOptions, scene: SparseScene) -> MeasuredFiles | None:
