@@ -14,14 +14,15 @@ import shapely
 from pipelines.adjust.relative import Solved
 from pipelines.change.datum import Epoch
 from pipelines.change.grid import CommonGrid, EpochRasters
+from pipelines.change.tied import Surfaces
 from pipelines.core.types import FloatArray
 from pipelines.formats.geotiff import sampled_raster
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import lla_from_enu
 from pipelines.survey.change_report import ChangedRegion
 
-_LEAST_POINTS = 3  # in a region, of which one may be wrong
-_HALF = 0.5  # of a region's mean change: if the surfaces' own errors are more, it is theirs
+_LEAST_POINTS = 2  # of a date in a region
+_HALF = 0.5  # of a change: if a surface's own error is more, the change is its error
 _AROUND_CELLS = 2.0  # of a point, where the surface has to be unbroken: a wall's points lie beneath the roof's edge
 _MARGIN_M = 2.0  # by which the adjustment may move points
 
@@ -33,17 +34,26 @@ class _Compared:
     plan: FloatArray
     off_m: FloatArray
     relief_m: FloatArray
+    step_m: float  # how far around it
 
-    def median_off_m(self, polygon: shapely.Geometry, most_relief_m: float) -> float:
-        """Return the median of surface minus point in a polygon; 0: too few points on unbroken ground."""
-        inside = shapely.contains_xy(polygon, *self.plan.T) & (self.relief_m <= most_relief_m)
-        return float(np.median(self.off_m[inside])) if inside.sum() >= _LEAST_POINTS else 0.0
+    def explain(self, polygon: shapely.Geometry, surfaces: Surfaces, sign: float, least_m: float) -> bool:
+        """Return whether most points on changed, unbroken ground of a polygon say that this surface is wrong there.
+
+        The surfaces differ by `least_m` on changed ground. `sign` is 1 of the later date, −1 of the earlier.
+        """
+        inside = shapely.contains_xy(polygon, *self.plan.T)
+        differs_m, off_m, relief_m = surfaces.risen_m(self.plan[inside]), self.off_m[inside], self.relief_m[inside]
+        witness = (np.abs(differs_m) >= least_m) & (relief_m <= np.maximum(np.abs(differs_m) / 2, self.step_m))
+        explained = witness & (sign * off_m * np.sign(differs_m) >= _HALF * np.abs(differs_m))
+        return bool(explained.sum() >= _LEAST_POINTS and 2 * explained.sum() > witness.sum())
 
 
 def contradicted_by_own_points(
-    grid: CommonGrid, regions: Sequence[ChangedRegion], polygons: Sequence[shapely.Geometry]
+    grid: CommonGrid, regions: Sequence[ChangedRegion], polygons: Sequence[shapely.Geometry], surfaces: Surfaces
 ) -> tuple[int, ...]:
-    """Return the places of the found regions of which tie points explain more than half, as an error of a surface.
+    """Return the places of the found regions that tie points of a date explain, as an error of its surface.
+
+    A point is a witness where the surfaces differ by half of the region's mean change at least: not at its rim.
 
     Polygons are in the plan of the CRS.
     """
@@ -51,15 +61,13 @@ def contradicted_by_own_points(
     if not found:
         return ()
     near = shapely.union_all([polygons[index] for index in found]).buffer(_MARGIN_M / grid.unit_m)
-    dates = [_compared(*date, grid.crs, near) for date in zip(grid.rasters, grid.epochs, strict=True)]
-    contradicted = []
-    for index in found:
-        mean_m = regions[index].net_m3 / regions[index].area_m2
-        relief_m = max(_HALF * abs(mean_m), _AROUND_CELLS * grid.cell_m)
-        before, after = (date.median_off_m(polygons[index], relief_m) for date in dates)
-        if abs(mean_m - (after - before)) < _HALF * abs(mean_m):
-            contradicted.append(index)
-    return tuple(contradicted)
+    before, after = (_compared(*date, grid.crs, near) for date in zip(grid.rasters, grid.epochs, strict=True))
+
+    def is_contradicted(index: int) -> bool:
+        polygon, least_m = polygons[index], _HALF * abs(regions[index].net_m3) / regions[index].area_m2
+        return after.explain(polygon, surfaces, 1.0, least_m) or before.explain(polygon, surfaces, -1.0, least_m)
+
+    return tuple(index for index in found if is_contradicted(index))
 
 
 def _compared(rasters: EpochRasters, epoch: Epoch, crs: PointCrs, near: shapely.Geometry) -> _Compared:
@@ -75,6 +83,5 @@ def _compared(rasters: EpochRasters, epoch: Epoch, crs: PointCrs, near: shapely.
     heights = heights.reshape(len(around), len(place))
     known = np.isfinite(heights).all(axis=0)
     heights, place = heights[:, known], place[known]
-    return _Compared(
-        place[:, :2], rasters.unit_m * (heights[0] - place[:, 2]), rasters.unit_m * np.ptp(heights, axis=0)
-    )
+    off, relief = heights[0] - place[:, 2], np.ptp(heights, axis=0)
+    return _Compared(place[:, :2], rasters.unit_m * off, rasters.unit_m * relief, crs.horizontal_unit * step)

@@ -330,12 +330,11 @@ def _counted(
 ) -> tuple[FoundRegions, DoubtfulRegions, list[str]]:
     """Return the regions that count, those that points contradict, and the names of those in a part."""
     contradicts, grid = Contradicted(), parts.grid
-    by_own = (
-        () if grid.rasters[0].of == "terrain" else contradicted_by_own_points(grid, found.regions, found.polygons)
-    )
+    surfaces = Surfaces(grid.crs, partial(sampled_raster, parts.folder.parent / "difference.tif"), noise.length_m)
+    by_own: tuple[int, ...] = ()
+    if grid.rasters[0].of == "surface":
+        by_own = contradicted_by_own_points(grid, found.regions, found.polygons, surfaces)
     if tied is not None:
-        risen_m = partial(sampled_raster, parts.folder.parent / "difference.tif")
-        surfaces = Surfaces(grid.crs, risen_m, noise.length_m)
         contradicts = contradicted(tied, found.regions, found.polygons, surfaces)
     reasons = dict.fromkeys(by_own, OFF_POINTS) | dict.fromkeys(contradicts.whole, DOUBTED)
     kept = [index for index in range(len(found.regions)) if index not in reasons]
