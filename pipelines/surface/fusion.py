@@ -5,7 +5,7 @@ the plan, so that the candidates of one fit into the memory.
 """
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
@@ -97,10 +97,17 @@ def fused_squares(
     """
     step = max(1, int(settings.spacing_m / pixel_on_surface_m(views, geo_from_model)))
     squares = _plan(views, geo_from_model, settings, step)
-    with progress.task("squares", len(squares)) as task, ThreadPoolExecutor(thread_count()) as pool:
-        for square, shown_by in squares:
-            in_square = partial(_candidates, views, geo_from_model, square, settings)
-            candidates = joined_rows(list(pool.map(in_square, [(int(number), step) for number in shown_by])))
+    with (
+        progress.task("squares", len(squares)) as task,
+        ThreadPoolExecutor(thread_count()) as pool,
+        ThreadPoolExecutor(1) as beside,
+    ):
+        gathered = partial(_gathered, views, geo_from_model, settings, step=step, pool=pool)
+        # Much of this is on one core: the next square's meanwhile keeps the others busy.
+        coming = [beside.submit(gathered, each) for each in squares[:1]]
+        for number, (square, _) in enumerate(squares):
+            candidates = coming.pop().result()
+            coming += [beside.submit(gathered, each) for each in squares[number + 1 : number + 2]]
             if len(candidates.position):
                 yield _fuse(candidates, views, geo_from_model, square, settings)
             task.advance()
@@ -108,11 +115,11 @@ def fused_squares(
 
 @dataclass(frozen=True)
 class _Candidates:
-    """As `SurfaceCloud`, with the width (P,) of a pixel at the point."""
+    """As `SurfaceCloud`, or the means of voxels, with the width (P,) of a pixel at the point."""
 
     position: FloatArray
     normal: FloatArray
-    rgb: ByteArray
+    rgb: ByteArray | FloatArray
     pixel_m: FloatArray
 
 
@@ -127,6 +134,22 @@ class _Square:
         """Return which points (P, 3) lie in the square."""
         offset = position[:, :2] - self.corner_m
         return np.asarray(((offset >= 0) & (offset < self.side_m)).all(axis=1))
+
+
+def _gathered(
+    views: SurfaceViews,
+    geo_from_model: Similarity,
+    settings: FusionSettings,
+    shown: tuple[_Square, IntArray],
+    *,
+    step: int,
+    pool: Executor,
+) -> _Candidates:
+    """Return the means over the voxels of the candidates in a square and its margin of the views that show it."""
+    square, shown_by = shown
+    in_square = partial(_candidates, views, geo_from_model, square, settings)
+    pixels = joined_rows(list(pool.map(in_square, [(int(number), step) for number in shown_by])))
+    return _Candidates(*voxel_means(settings.spacing_m, pixels.position, *vars(pixels).values()))
 
 
 def _candidates(
@@ -214,9 +237,7 @@ def _fuse(
     square: _Square,
     settings: FusionSettings,
 ) -> SurfaceCloud:
-    side_m = settings.spacing_m
-    position, normal, rgb, pixel_m = voxel_means(side_m, candidates.position, *vars(candidates).values())
-    normal = _unit(normal)
+    position, normal, pixel_m = candidates.position, _unit(candidates.normal), candidates.pixel_m
     support = views.support(geo_from_model.inverse().apply(position), normal @ geo_from_model.rotation)
     sigma_m = surface_sigma(support, pixel_m)
     moved = position + support.mean_normal_m[:, None] * normal
@@ -225,7 +246,7 @@ def _fuse(
         good &= (sigma_m < _RESOLVED * pixel_m) & square.covers(moved)
     rows = np.flatnonzero(good)
     position, normal, rgb, variance = voxel_means(
-        side_m, moved[rows], moved[rows], normal[rows], rgb[rows], sigma_m[rows] ** 2
+        settings.spacing_m, moved[rows], moved[rows], normal[rows], candidates.rgb[rows], sigma_m[rows] ** 2
     )
     return SurfaceCloud(position, _unit(normal), np.round(rgb).astype(np.uint8), np.sqrt(variance))
 
