@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 
 from pipelines.core.child import run_in_child
 from pipelines.core.json_values import JsonValue
+from pipelines.core.machine import thread_count
 from pipelines.core.progress import SILENT, Progress
 from pipelines.core.types import BoolArray, FloatArray
 from pipelines.formats.colmap import quiet_colmap
@@ -28,8 +29,6 @@ _RIM = (
     1.75  # spacings by which the surface may go beyond the points: farther, it was mostly wrong by 0.1 m and more
 )
 _CLOSED, _CLOSED_M = 10.0, 2.0  # widest gap that is closed: spacings, and metres, whichever is more
-# One thread: more share sums in an order that changes from run to run, and wait for each other actively.
-_THREADS = 1
 _CERTAIN = 0.5  # spacings: largest σ of a certain point
 _POINT_WEIGHT = 4.0  # of the points' places over their normals; of 1, 4 and 16 the best on a simulated flight
 _RIM_WEIGHT = 1.0  # of an open edge over the faces in the simplification: rims move by its error at most
@@ -135,10 +134,13 @@ def near_points(mesh: RawMesh, points: MeasuredPoints) -> RawMesh:
 
 
 def solve_poisson(arguments: Mapping[str, JsonValue], progress: Progress) -> None:
-    """Write the surface through the points of a file, in a child process."""
+    """Write the surface through the points of a file, in a child process.
+
+    Threads share sums in an order that changes from run to run: the last digits of the vertices do too.
+    """
     with quiet_colmap() as colmap, progress.task("surface"):
         options = colmap.PoissonMeshingOptions(
-            depth=arguments["depth"], point_weight=_POINT_WEIGHT, trim=0.0, color=False, num_threads=_THREADS
+            depth=arguments["depth"], point_weight=_POINT_WEIGHT, trim=0.0, color=False, num_threads=thread_count()
         )
         colmap.poisson_meshing(arguments["points"], arguments["surface"], options)
 
@@ -171,7 +173,7 @@ def simplify(arguments: Mapping[str, JsonValue], progress: Progress) -> None:
             max_error=arguments["error"] ** 2,
             boundary_weight=_RIM_WEIGHT,
             interpolate_colors=False,
-            num_threads=_THREADS,
+            num_threads=thread_count(),
         )
         colmap.simplify_mesh(arguments["mesh"], arguments["simple"], options)
 
