@@ -152,13 +152,12 @@ def _points(
     spacing_m = options.voxel
     while True:
         settings = fusion_settings(views, geo_from_model, options.min_views, spacing_m)
-        west, south, east, north = area.polygon.buffer(_AROUND * settings.spacing_m).bounds
+        around = replace(area, polygon=area.polygon.buffer(_AROUND * settings.spacing_m))
         parts = []
         for square in shared_squares(views, geo_from_model, settings, progress):
-            plan = square.position[:, :2]
-            near = ((plan >= (west, south)) & (plan <= (east, north))).all(axis=1)
             # Points whose normals cancel say nothing of the side.
-            parts.append(rows_of(square, np.flatnonzero(near & np.isfinite(square.normal).all(axis=1))))
+            with_side = np.isfinite(square.normal).all(axis=1)
+            parts.append(rows_of(square, np.flatnonzero(around.contains(square.position) & with_side)))
         if sum(len(part.position) for part in parts) < _LEAST_POINTS:
             raise _no_surface(options)
         cloud = joined_rows(parts)
