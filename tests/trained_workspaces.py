@@ -107,3 +107,11 @@ def untrained(workspace: Workspace) -> None:
     )
     workspace.path(TRAIN_POSTERIOR).rename(workspace.root / SIM3_POSTERIOR)
     shutil.rmtree(workspace.root / "train")
+
+
+def own_copy(workspace: Workspace, root: Path) -> Workspace:
+    """Return a copy with a cache of its own; those of one flight share theirs, which serves one process at a time."""
+    shutil.copytree(workspace.root, root, symlinks=True)
+    (root / "cache").unlink()
+    (root / "cache").mkdir()
+    return Workspace(root)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,6 +31,7 @@ from pipelines.survey.navigation import load_survey
 from tests.depth_scenes import BOX_M, CAMERA, DOWN, depth_map, looking_down
 from tests.refusals import numbers, refused
 from tests.splat_scenes import ground_height
+from tests.trained_workspaces import own_copy
 
 GEO_FROM_MODEL = Similarity(1.0, np.eye(3), np.array([1000.0, -500.0, 20.0]))
 CENTERS = looking_down(8)
@@ -164,8 +164,7 @@ def test_cloud_of_a_trained_survey_lies_on_its_ground(
     trained: list[tuple[Workspace, Workspace]], tmp_path: Path
 ) -> None:
     root = tmp_path / "ws"
-    shutil.copytree(trained[0][0].root, root, symlinks=True)
-    workspace = Workspace(root)
+    workspace = own_copy(trained[0][0], root)
     values = run_stage(workspace, BY_NAME["export-cloud"], {"crs": "EPSG:4978", "ply": True}).manifest.values
     assert len(list((workspace.cache / "rendered").iterdir())) == 1  # for the next deliverable
     files = {path.name for path in (root / "cloud").iterdir()}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +30,7 @@ from pipelines.surface.fusion import SurfaceCloud
 from pipelines.survey.navigation import load_survey
 from tests.refusals import numbers, refused
 from tests.splat_scenes import ground_height
+from tests.trained_workspaces import own_copy
 
 GEO_FROM_MODEL = Similarity(2.0, exp_so3(np.array([0.3, -0.2, 1.1])), np.array([100.0, 50.0, 3.0]))
 SPACING_M = 0.25
@@ -146,8 +146,7 @@ def test_command_puts_centres_on_the_surface(
     """In a file of its own, which leaves the ordinary one as it is, and is stale by itself."""
     caplog.set_level("INFO")
     root = tmp_path / "ws"
-    shutil.copytree(trained[0][0].root, root, symlinks=True)
-    workspace = Workspace(root)
+    workspace = own_copy(trained[0][0], root)
     origin = load_survey(workspace).origin
     run_stage(workspace, BY_NAME["export-ply"], {})
     plain, plain_bytes = (
@@ -191,7 +190,7 @@ def test_too_many_discs_are_refused(
     trained: list[tuple[Workspace, Workspace]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = tmp_path / "ws"
-    shutil.copytree(trained[0][0].root, root, symlinks=True)
+    own_copy(trained[0][0], root)
     monkeypatch.setattr(measurable, "free_memory_bytes", lambda _device: 2**27)
     with refused("memory-discs", ResourceError):
         run_stage(Workspace(root), BY_NAME["export-measurable"], {})
@@ -201,7 +200,7 @@ def test_too_many_discs_are_refused(
 @pytest.mark.slow
 def test_a_model_without_a_surface_is_refused(trained: list[tuple[Workspace, Workspace]], tmp_path: Path) -> None:
     root = tmp_path / "ws"
-    shutil.copytree(trained[0][0].root, root, symlinks=True)
+    own_copy(trained[0][0], root)
     haze = read_gaussians(root / GAUSSIANS)
     haze.logit_opacities.fill_(-5.0)
     write_gaussians(root / GAUSSIANS, haze)

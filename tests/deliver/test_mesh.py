@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -54,6 +53,7 @@ from pipelines.survey.navigation import load_survey
 from tests.depth_scenes import BOX_M, CAMERA, DOWN, UP, depth_map, looking_down
 from tests.refusals import refused
 from tests.splat_scenes import ground_height
+from tests.trained_workspaces import own_copy
 
 GEO_FROM_MODEL = Similarity(1.0, np.eye(3), np.array([1000.3, -500.2, 20.1]))
 CENTERS = looking_down(8)
@@ -406,8 +406,7 @@ def test_mesh_of_a_trained_survey_lies_on_its_ground(
     trained: list[tuple[Workspace, Workspace]], tmp_path: Path
 ) -> None:
     root = tmp_path / "ws"
-    shutil.copytree(trained[0][0].root, root, symlinks=True)
-    workspace = Workspace(root)
+    workspace = own_copy(trained[0][0], root)
     options = {"crs": "EPSG:4978", "watertight": True, "obj": True}
     values = run_stage(workspace, BY_NAME["export-mesh"], options).manifest.values
     assert {path.name for path in (root / "mesh").iterdir()} == {
