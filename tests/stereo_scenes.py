@@ -38,8 +38,8 @@ def painted(seed: int, right_m: np.ndarray, up_m: np.ndarray) -> np.ndarray:
 
 
 def photographed(camera: ViewPose, grey: np.ndarray) -> StereoView:
-    """Return a view of grey levels (H, W), clipped to 0 … 255."""
-    return StereoView(camera, np.clip(grey + 1, 1, 256).astype(np.float32))
+    """Return a view of grey levels (H, W), rounded and clipped to 1 … 255."""
+    return StereoView(camera, np.clip(np.rint(grey), 1, 255).astype(np.uint8))
 
 
 def true_depth(camera: ViewPose) -> np.ndarray:

@@ -124,8 +124,10 @@ class ViewPose:
 
     def rays(self) -> FloatArray:
         """Return viewing rays (H, W, 3) along the axes of `model`, of length one along the optical axis."""
-        x, y = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
-        return self.pinhole.rays(np.stack([x, y], axis=-1)) @ self.cam_from_model
+        pinhole, (right, down, ahead) = self.pinhole, self.cam_from_model
+        x = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
+        y = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
+        return np.asarray(y[:, None, None] * down + (x[:, None] * right + ahead))
 
 
 def pose_matrix(cam_from_world: FloatArray, cam_center_in_world: FloatArray) -> FloatArray:

@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from pipelines.core.types import ByteArray, Float32Array, FloatArray
 from pipelines.geometry.cameras import ViewPose
 from pipelines.splat.kernel_cache import kernel
-from pipelines.surface.matching import UNSEEN, Matcher, MatchSettings, StereoView, WinnerTakesAll, camera_matrix
+from pipelines.surface.matching import (
+    UNSEEN,
+    Matcher,
+    MatchSettings,
+    StereoView,
+    WinnerTakesAll,
+    camera_matrix,
+    is_hypothesis,
+)
 from pipelines.surface.sweep import NormalMap, SweepResult, sweep_result
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
@@ -210,7 +218,8 @@ def refine(
     with np.errstate(divide="ignore"):
         step = (prior.step_m / prior.normals.offset_per_metre(reference.camera)).astype(np.float32)
     for number in range(-_REACH, _REACH + 1):
-        search.add(matcher(middle + np.float32(number) * step))
+        depth = middle + np.float32(number) * step
+        search.add(matcher(depth), is_hypothesis(depth))
     winner = search.winner()
     offset = prior.offset_m + (winner.hypothesis - _REACH) * prior.step_m
     refined = sweep_result(winner, reference.camera, prior.normals, offset, prior.step_m)

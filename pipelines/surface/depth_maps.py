@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -30,6 +30,7 @@ from pipelines.survey.scene import SparseScene
 # Layout of the cached arrays, a part of their key: files of another layout lie in another folder.
 _LAYOUT = b"levels: direction, offset, score, step, sharpness, by kernels"
 _NEIGHBOURS = 10  # views that each view is compared with
+_VIEWS_KEPT = 64  # of the last ones, shrunken: they are the neighbours of the next
 _KEY_DECIMALS = 6  # of metres and of direction cosines, in the key of the cache
 
 
@@ -47,13 +48,13 @@ class PyramidLevel:
 # a small window does not extend it across the foot of a wall.
 MIDDLE = PyramidLevel("middle", 320, MatchSettings(), steps=1.5)
 FINE = PyramidLevel("fine", 640, MatchSettings(window_px=3, reach_px=2), steps=3.0)
-_LEVELS = (PyramidLevel("coarse", 200, MatchSettings(window_px=3, reach_px=3)), MIDDLE, FINE)
+LEVELS = (PyramidLevel("coarse", 200, MatchSettings(window_px=3, reach_px=3)), MIDDLE, FINE)
 
 
 class DepthMaps:
     """Depth maps of the training photographs, computed once and cached on disk.
 
-    Memory holds no more than one view and its neighbours.
+    Memory holds no more than a few views and their neighbours.
 
     Args:
         folder: cache, in which each scene has a folder of its own.
@@ -64,6 +65,7 @@ class DepthMaps:
         # Each neighbour of a view needs the view's planes and neighbours, too.
         self._neighbours = cache(lambda index: best_neighbours(scene.network, index, scene.train, _NEIGHBOURS))
         self._planes = cache(self._find_planes)
+        self._view = lru_cache(_VIEWS_KEPT)(self._load_view)
         self.folder = folder / self._key()
 
     def build(self, progress: Progress = SILENT) -> None:
@@ -73,8 +75,8 @@ class DepthMaps:
         step begins.
         """
         train = [int(index) for index in self.scene.train]
-        steps: list[tuple[str, Callable[[int], Float32Array]]] = [(_LEVELS[0].name, self._sweep)]
-        for before, level in itertools.pairwise(_LEVELS):
+        steps: list[tuple[str, Callable[[int], Float32Array]]] = [(LEVELS[0].name, self._sweep)]
+        for before, level in itertools.pairwise(LEVELS):
             steps.append((level.name, partial(self._refine, before, level)))
         steps.append(("depth", self._agree))
         if not all(self._path(index, "depth").exists() for index in train):
@@ -127,7 +129,7 @@ class DepthMaps:
         return np.asarray(small, np.uint8)
 
     def _sweep(self, index: int) -> Float32Array:
-        sweeps, others, level = self._planes(index), self._neighbours(index), _LEVELS[0]
+        sweeps, others, level = self._planes(index), self._neighbours(index), LEVELS[0]
         if not sweeps:
             return _empty_maps(self.camera(index, level))
         reference, *views = (self._view(j, level) for j in (index, *others))
@@ -169,15 +171,15 @@ class DepthMaps:
             return []
         sparse = self.scene.sparse
         points = self.scene.point_in_model[np.unique(sparse.obs_point[sparse.obs_image == index])]
-        pose, *around = (self._pose(j, _LEVELS[0]) for j in (index, *others))
+        pose, *around = (self._pose(j, LEVELS[0]) for j in (index, *others))
         return planes_for(pose, around, points)
 
     def _pose(self, index: int, level: PyramidLevel) -> ViewPose:
         poses = self.scene.poses
         return ViewPose(self.camera(index, level), poses.cam_from_model[index], poses.cam_center_in_model[index])
 
-    def _view(self, index: int, level: PyramidLevel) -> StereoView:
-        grey = cv2.cvtColor(self.rgb(index, level), cv2.COLOR_RGB2GRAY).astype(np.float32) + 1
+    def _load_view(self, index: int, level: PyramidLevel) -> StereoView:
+        grey = np.maximum(cv2.cvtColor(self.rgb(index, level), cv2.COLOR_RGB2GRAY), 1)
         mask = np.array(self.images.mask(index), dtype=np.uint8)
         grey[cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST) == 0] = 0
         return StereoView(self._pose(index, level), grey)
@@ -201,7 +203,7 @@ class DepthMaps:
             digest.update(self.images.key(index).encode())
             if self.images.is_masked(index):
                 digest.update(self.images.mask_key(index).encode())
-        digest.update(repr((_LEVELS, _NEIGHBOURS, THRESHOLDS)).encode())
+        digest.update(repr((LEVELS, _NEIGHBOURS, THRESHOLDS)).encode())
         return digest.hexdigest()[:32]
 
 

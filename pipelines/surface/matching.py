@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipelines.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import Pinhole, ViewPose
 from pipelines.splat.kernel_cache import kernel
 
@@ -30,7 +30,9 @@ _FAST = {"contract", "nsz", "arcp", "reassoc", "nnan", "ninf"}
 _UNSEEN = np.float32(-1.0)  # correlation outside a neighbour's image
 NOISE_VARIANCE = np.float32(0.3)  # grey levels²: windows that vary less than the sensor's noise do not correlate
 _LEAST_DEPTH = np.float32(1e-3)
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ZERO, _ONE, _BYTE = np.float32(0.0), np.float32(1.0), np.uint32(255)
+_FURTHEST_M = np.float32(1e7)  # hypotheses beyond are as good as infinite, and kernels need finite numbers
+_BEST_VIEWS = 3  # number of neighbours that count, the best of all
 
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy", inline="always")
@@ -40,8 +42,20 @@ def _reflected(row: int, height: int) -> int:
     return 2 * height - inside - 1 if inside >= height else inside
 
 
+@njit(nogil=True, error_model="numpy")
+def _finite_row(
+    depth: Float32Array,  # (W,) float32
+    finite: Float32Array,  # (W,) float32
+) -> None:
+    """Write the depths of hypotheses into `finite`, 0 for others: here alone NaN and infinity may come in."""
+    for i in range(depth.shape[0]):
+        usable = (depth[i] > _ZERO) & (depth[i] < _FURTHEST_M)
+        finite[i] = depth[i] if usable else _ZERO
+
+
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
 def _project_row(
+    columns: Float32Array,  # (W,) float32
     depth: Float32Array,  # (W,) float32
     row: int,
     per_depth: Float32Array,  # (3, 3) float32
@@ -64,7 +78,7 @@ def _project_row(
     x_step, y_step, z_step = per_depth[0, 0], per_depth[1, 0], per_depth[2, 0]
     x_start, y_start, z_start, right, bottom = start[0], start[1], start[2], size[0], size[1]
     for i in range(depth.shape[0]):
-        column, d = np.float32(i), depth[i]
+        column, d = columns[i], depth[i]
         z = d * (z_step * column + z0) + z_start
         ahead = max(z, _LEAST_DEPTH)
         inverse = _ONE / ahead
@@ -80,19 +94,23 @@ def _project_row(
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
 def _sample_row(
-    grey: Float32Array,  # (h · w,) float32
-    stride: int,
+    quads: NDArray[np.uint32],  # (h · w,) uint32
     place: NDArray[np.int32],  # (W,) int32
     fraction: Float32Array,  # (2, W) float32
     miss: Float32Array,  # (W,) float32
+    quad: NDArray[np.uint32],  # (W,) uint32
     shown: Float32Array,  # (W,) float32
 ) -> None:
-    """Write the interpolated grey levels at places into `shown` (W,); 0 where the place was missed."""
-    down = np.uint32(stride)
+    """Write the interpolated grey levels at places into `shown` (W,); 0 where the place was missed.
+
+    `quad` (W,) is scratch: reads from anywhere are no vector instructions, and would keep the rest from being some.
+    """
     for i in range(place.shape[0]):
-        first = np.uint32(place[i])
-        a, b = grey[first], grey[first + np.uint32(1)]
-        c, d = grey[first + down], grey[first + down + np.uint32(1)]
+        quad[i] = quads[np.uint32(place[i])]
+    for i in range(place.shape[0]):
+        four = quad[i]
+        a, b = np.float32(np.int32(four & _BYTE)), np.float32(np.int32((four >> np.uint32(8)) & _BYTE))
+        c, d = np.float32(np.int32((four >> np.uint32(16)) & _BYTE)), np.float32(np.int32(four >> np.uint32(24)))
         above, below = a + fraction[0, i] * (b - a), c + fraction[0, i] * (d - c)
         level = above + fraction[1, i] * (below - above)
         shown[i] = level if miss[i] == _ZERO else _ZERO
@@ -100,26 +118,23 @@ def _sample_row(
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
 def _add_across(
+    window: tuple[int, ...],
     reference: Float32Array,  # (W + 2 half,) float32
     padded: Float32Array,  # (W + 2 half,) float32
-    half: int,
     sums: Float32Array,  # (3, W) float32
 ) -> None:
     """Write Σ other, Σ other², Σ reference · other over windows along a row into sums (3, W).
 
     Both rows (W + 2 half,) are mirrored at their ends; `padded` is that of the neighbour, as the reference sees it.
     """
-    width = sums.shape[1]
-    for k in range(2 * half + 1):
-        for i in range(width):
+    for i in range(sums.shape[1]):
+        total, square, product = padded[i], padded[i] * padded[i], reference[i] * padded[i]
+        for k in range(1, len(window)):
             level = padded[i + k]
-            product = reference[i + k] * level
-            if k == 0:
-                sums[0, i], sums[1, i], sums[2, i] = level, level * level, product
-            else:
-                sums[0, i] += level
-                sums[1, i] += level * level
-                sums[2, i] += product
+            total += level
+            square += level * level
+            product += reference[i + k] * level
+        sums[0, i], sums[1, i], sums[2, i] = total, square, product
 
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
@@ -135,138 +150,151 @@ def _mirror_ends(
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
 def _correlate_row(
+    window: tuple[int, ...],
     ring: Float32Array,  # (window, 3, W) float32
     shown: Float32Array,  # (W,) float32
     mean: Float32Array,  # (W,) float32
     inverse_sigma: Float32Array,  # (W,) float32
-    total: Float32Array,  # (3, W) float32
     score: Float32Array,  # (W,) float32
 ) -> None:
     """Write the correlation of a row with a neighbour into score (W,).
 
     The ring (window, 3, W) has sums along the rows of the window, `shown` (W,) the neighbour's grey levels at the
-    row itself, mean and inverse σ (W,) are those of the reference's windows, `total` (3, W) is scratch.
+    row itself, mean and inverse σ (W,) are those of the reference's windows.
     """
-    window, width = ring.shape[0], shown.shape[0]
-    share = np.float32(1.0 / (window * window))
-    for q in range(3):
-        for i in range(width):
-            total[q, i] = ring[0, q, i]
-        for k in range(1, window):
-            for i in range(width):
-                total[q, i] += ring[k, q, i]
-    for i in range(width):
-        other = total[0, i] * share
-        variance = max(total[1, i] * share - other * other, NOISE_VARIANCE)
-        level = (total[2, i] * share - mean[i] * other) * inverse_sigma[i] / np.sqrt(variance)
+    share = np.float32(1.0 / (len(window) * len(window)))
+    for i in range(shown.shape[0]):
+        total, square, product = ring[0, 0, i], ring[0, 1, i], ring[0, 2, i]
+        for k in range(1, len(window)):
+            total += ring[k, 0, i]
+            square += ring[k, 1, i]
+            product += ring[k, 2, i]
+        other = total * share
+        variance = max(square * share - other * other, NOISE_VARIANCE)
+        level = (product * share - mean[i] * other) * inverse_sigma[i] / np.sqrt(variance)
         score[i] = _UNSEEN if shown[i] == _ZERO else level
 
 
 @njit(nogil=True, fastmath=_FAST, error_model="numpy")
 def _keep_largest(
     score: Float32Array,  # (W,) float32
-    largest: Float32Array,  # (k, W) float32
+    largest: Float32Array,  # (3, W) float32
 ) -> None:
-    """Insert scores (W,) into the sorted largest (k, W) so far; overwrites them."""
-    for rank in range(largest.shape[0]):
-        for i in range(score.shape[0]):
-            kept, new = largest[rank, i], score[i]
-            largest[rank, i] = max(kept, new)
-            score[i] = min(kept, new)
+    """Insert scores (W,) into the three largest (3, W) so far, largest first."""
+    for i in range(score.shape[0]):
+        new = score[i]
+        first, second, third = largest[0, i], largest[1, i], largest[2, i]
+        largest[0, i], new = max(first, new), min(first, new)
+        largest[1, i], new = max(second, new), min(second, new)
+        largest[2, i] = max(third, new)
 
 
 @kernel(nogil=True, fastmath=_FAST, error_model="numpy")
 def match_rows(
+    window: tuple[int, ...],
     depth: Float32Array,  # (H, W) float32
     rows: IntArray,  # (2,) int64
     reference: Float32Array,  # (H, W + 2 half) float32
     mean: Float32Array,  # (H, W) float32
     inverse_sigma: Float32Array,  # (H, W) float32
-    greys: Float32Array,  # (n, h + 1, w + 1) float32
+    quads: NDArray[np.uint32],  # (n, h, w) uint32
     sizes: Float32Array,  # (n, 2) float32
     per_depth: Float32Array,  # (n, 3, 3) float32
     starts: Float32Array,  # (n, 3) float32
-    out: Float32Array,  # (H, k, W) float32
+    out: Float32Array,  # (H, W) float32
 ) -> None:
-    """Write the best correlations of some rows of a view with n neighbours, under a hypothesis of depth.
+    """Write the mean of the best correlations of some rows of a view with n neighbours, for a hypothesis of depth.
 
     Args:
-        depth: (H, W) hypothesis, finite.
+        window: as many numbers as the window has pixels along its side. Their count is known to the compiler, which
+            makes one kernel for each, without loops over the window.
+        depth: (H, W) hypothesis.
         rows: (2,) first row and the row after the last.
         reference: (H, W + 2 half) grey levels, mirrored at the ends of rows; half = window // 2.
         mean: (H, W) of the reference's windows.
         inverse_sigma: (H, W) of the reference's windows.
-        greys: (n, h + 1, w + 1) grey levels of the neighbours; the last row and column are not read with weight.
+        quads: (n, h, w) grey levels of the neighbours, as `_quads` packs them.
         sizes: (n, 2) largest column and row of each neighbour, float32.
         per_depth: (n, 3, 3) float32, starts: (n, 3) float32: of a pixel (column, row) at depth d, the neighbour's
             homogeneous pixel is d · per_depth · (column, row, 1) + start.
-        out: (H, k, W) the largest correlations, largest first, k at most n.
+        out: (H, W) mean of the three largest correlations, or of all if there are fewer.
     """
-    count, height, width = len(greys), depth.shape[0], depth.shape[1]
-    half = (reference.shape[1] - width) // 2
-    window, stride = 2 * half + 1, greys.shape[2]
-    flat = greys.reshape(count, -1)
-    ring = np.empty((count, window, 3, width), np.float32)
-    shown = np.zeros((count, window, width + 2 * half), np.float32)
-    place, fraction = np.empty(width, np.int32), np.empty((2, width), np.float32)
-    miss, score, total = np.empty(width, np.float32), np.empty(width, np.float32), np.empty((3, width), np.float32)
+    count, height, width = len(quads), depth.shape[0], depth.shape[1]
+    side, half, stride, counted = len(window), len(window) // 2, quads.shape[2], min(count, _BEST_VIEWS)
+    flat, columns = quads.reshape(count, -1), np.arange(width).astype(np.float32)
+    ring = np.empty((count, side, 3, width), np.float32)
+    shown = np.zeros((count, side, width + 2 * half), np.float32)
+    place, quad = np.empty(width, np.int32), np.empty(width, np.uint32)
+    fraction, finite = np.empty((2, width), np.float32), np.empty(width, np.float32)
+    miss, score = np.empty(width, np.float32), np.empty(width, np.float32)
+    largest = np.empty((_BEST_VIEWS, width), np.float32)
     for pushed in range(rows[0] - half, rows[1] + half):
-        row, slot = _reflected(pushed, height), (pushed + window) % window
+        row, slot = _reflected(pushed, height), (pushed + side) % side
         done = pushed - half
-        if done >= rows[0]:
-            out[done] = np.float32(-2.0)
+        _finite_row(depth[row], finite)
+        largest[:] = np.float32(-2.0)
         for k in range(count):
-            _project_row(depth[row], row, per_depth[k], starts[k], sizes[k], stride, place, fraction, miss)
-            _sample_row(flat[k], stride, place, fraction, miss, shown[k, slot, half : half + width])
+            _project_row(columns, finite, row, per_depth[k], starts[k], sizes[k], stride, place, fraction, miss)
+            _sample_row(flat[k], place, fraction, miss, quad, shown[k, slot, half : half + width])
             _mirror_ends(shown[k, slot], half)
-            _add_across(reference[row], shown[k, slot], half, ring[k, slot])
+            _add_across(window, reference[row], shown[k, slot], ring[k, slot])
             if done >= rows[0]:
-                middle = shown[k, (done + window) % window, half : half + width]
-                _correlate_row(ring[k], middle, mean[done], inverse_sigma[done], total, score)
-                _keep_largest(score, out[done])
+                middle = shown[k, (done + side) % side, half : half + width]
+                _correlate_row(window, ring[k], middle, mean[done], inverse_sigma[done], score)
+                _keep_largest(score, largest)
+        if done >= rows[0]:
+            out[done] = largest[:counted].sum(axis=0) / np.float32(counted)
 
 
 @kernel(nogil=True, error_model="numpy")
 def keep_winner(
     number: int,
-    score: Float32Array,  # (P,) float32
-    last: Float32Array,  # (P,) float32
-    best: Float32Array,  # (P,) float32
-    before: Float32Array,  # (P,) float32
-    after: Float32Array,  # (P,) float32
-    hypothesis: NDArray[np.int32],  # (P,) int32
+    first: int,
+    score: Float32Array,  # (h, W) float32
+    seen: BoolArray,  # (H, W) bool
+    last: Float32Array,  # (H, W) float32
+    best: Float32Array,  # (H, W) float32
+    before: Float32Array,  # (H, W) float32
+    after: Float32Array,  # (H, W) float32
+    hypothesis: NDArray[np.int32],  # (H, W) int32
 ) -> None:
     """Compare the scores of hypothesis `number` with the best so far, pixel by pixel.
 
     Args:
         number: of the hypothesis, from 0.
-        score: (P,) its scores.
-        last: (P,) scores of the hypothesis before; receives `score`.
-        best: (P,) largest scores so far.
-        before: (P,) scores of the hypotheses before the best ones.
-        after: (P,) scores of those after the best ones.
-        hypothesis: (P,) numbers of the best, int32.
+        first: row of the first scores.
+        score: (h, W) its scores; it has none in other rows.
+        seen: (H, W) whether it has a score.
+        last: (H, W) scores of the hypothesis before; receives those of this one.
+        best: (H, W) largest scores so far.
+        before: (H, W) scores of the hypotheses before the best ones.
+        after: (H, W) scores of those after the best ones.
+        hypothesis: (H, W) numbers of the best, int32.
     """
-    for i in range(score.shape[0]):
-        new = score[i]
-        if new > best[i]:
-            best[i], before[i], after[i], hypothesis[i] = new, last[i], np.float32(-2.0), number
-        elif hypothesis[i] == number - 1:
-            after[i] = new
-        last[i] = new
+    for row in range(seen.shape[0]):
+        if row < first or row >= first + score.shape[0]:
+            last[row] = _UNSEEN
+            continue
+        for i in range(seen.shape[1]):
+            new = score[row - first, i] if seen[row, i] else _UNSEEN
+            better, next_ = new > best[row, i], hypothesis[row, i] == number - 1
+            after[row, i] = np.float32(-2.0) if better else (new if next_ else after[row, i])
+            before[row, i] = last[row, i] if better else before[row, i]
+            hypothesis[row, i] = np.int32(number) if better else hypothesis[row, i]
+            best[row, i] = new if better else best[row, i]
+            last[row, i] = new
 
 
 UNSEEN = float(_UNSEEN)
 _LEAST_CURVATURE = 1e-6
-_FURTHEST_M = 1e7  # hypotheses beyond are as good as infinite, and kernels need finite numbers
 
 
 @dataclass(frozen=True)
 class StereoView:
-    """Photograph (H, W) with its camera; grey levels 1 … 256, 0 outside the photograph's valid part."""
+    """Photograph (H, W) with its camera; grey levels 1 … 255, 0 outside the photograph's valid part."""
 
     camera: ViewPose
-    grey: Float32Array
+    grey: ByteArray
 
 
 def camera_matrix(camera: Pinhole, offset_px: float = 0.0) -> FloatArray:
@@ -281,7 +309,6 @@ class MatchSettings:
     window_px: int = 5  # side of the correlation window, odd
     reach_px: int = 6  # radius of the guided filter that averages correlations
     edge_grey: float = 10.0  # step in grey levels across which the filter does not average
-    views: int = 3  # number of neighbours that count, the best of all
 
     @property
     def support_px(self) -> int:
@@ -293,7 +320,7 @@ class Matcher:
     """Compares a photograph (H, W) with its neighbours under hypotheses of depth."""
 
     def __init__(self, reference: StereoView, neighbours: list[StereoView], settings: MatchSettings) -> None:
-        grey, side = reference.grey, (settings.window_px, settings.window_px)
+        grey, side = reference.grey.astype(np.float32), (settings.window_px, settings.window_px)
         self._settings, self._grey = settings, grey
         self._mean, square = (
             np.asarray(cv2.boxFilter(image, -1, side, borderType=cv2.BORDER_REFLECT), np.float32)
@@ -303,27 +330,26 @@ class Matcher:
         self._inverse_sigma = (1 / np.sqrt(np.maximum(variance, NOISE_VARIANCE))).astype(np.float32)
         half = settings.window_px // 2
         self._mirrored = np.pad(grey, ((0, 0), (half, half)), mode="symmetric")
-        self._greys, self._sizes = _stacked([view.grey for view in neighbours])
+        self._quads, self._sizes = _quads([view.grey for view in neighbours])
         self._per_depth, self._starts = _projections(reference, neighbours)
-        height, width = grey.shape
-        self._largest = np.empty((height, min(settings.views, len(neighbours)), width), np.float32)
+        self._mean_of_best = np.empty(grey.shape, np.float32)
         self._guided: tuple[slice, cv2.ximgproc.GuidedFilter] | None = None
 
     def __call__(self, depth: Float32Array, rows: slice | None = None) -> Float32Array:
         """Return the score (h, W) of depths (H, W) along the optical axis in some rows of the view; None: all.
 
-        Depths that are not positive are no hypothesis: UNSEEN. Rows within the settings' `support_px` of either end
-        are less exact.
+        It says nothing where a depth is no hypothesis. Rows within the settings' `support_px` of either end are
+        less exact.
         """
         part = rows or slice(0, len(self._grey))
-        seen = (depth > 0) & (depth < _FURTHEST_M)
+        if part.start == part.stop:
+            return self._mean_of_best[part]
         match_rows(
-            *(np.where(seen, depth, np.float32(0)), np.array([part.start, part.stop]), self._mirrored),
-            *(self._mean, self._inverse_sigma, self._greys, self._sizes, self._per_depth, self._starts),
-            self._largest,
+            *(tuple(range(self._settings.window_px)), depth, np.array([part.start, part.stop]), self._mirrored),
+            *(self._mean, self._inverse_sigma, self._quads, self._sizes, self._per_depth, self._starts),
+            self._mean_of_best,
         )
-        score = self._filter(part).filter(self._largest[part].mean(axis=1))
-        return np.where(seen[part], score, np.float32(UNSEEN))
+        return np.asarray(self._filter(part).filter(self._mean_of_best[part]), np.float32)
 
     def _filter(self, part: slice) -> cv2.ximgproc.GuidedFilter:
         """Return the guided filter of some rows; the rows of a hypothesis are mostly those of the one before."""
@@ -334,13 +360,24 @@ class Matcher:
         return self._guided[1]
 
 
-def _stacked(images: list[Float32Array]) -> tuple[Float32Array, Float32Array]:
-    """Return images in one array (n, h + 1, w + 1), and the largest column and row (n, 2) of each."""
+def is_hypothesis(depth: Float32Array) -> BoolArray:
+    """Return whether depths (H, W) are such that a place can lie at them: positive, and not as good as infinite."""
+    return np.asarray((depth > 0) & (depth < _FURTHEST_M))
+
+
+def _quads(images: list[ByteArray]) -> tuple[NDArray[np.uint32], Float32Array]:
+    """Return images in one array (n, h, w), and the largest column and row (n, 2) of each.
+
+    A number holds the grey levels of four pixels, from the lowest byte: this one, the next of its row, and the two
+    below. Interpolation then reads one place of the memory instead of four. Beyond an image are zeros.
+    """
     height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
-    greys = np.zeros((len(images), height + 1, width + 1), np.float32)
+    greys = np.zeros((len(images), height + 1, width + 1), np.uint32)
     for grey, image in zip(greys, images, strict=True):
         grey[: image.shape[0], : image.shape[1]] = image
-    return greys, np.array([[image.shape[1] - 1, image.shape[0] - 1] for image in images], np.float32)
+    upper = greys[:, :, :-1] | greys[:, :, 1:] << 8
+    sizes = np.array([[image.shape[1] - 1, image.shape[0] - 1] for image in images], np.float32)
+    return upper[:, :-1] | upper[:, 1:] << 16, sizes
 
 
 def _projections(reference: StereoView, neighbours: list[StereoView]) -> tuple[Float32Array, Float32Array]:
@@ -368,15 +405,15 @@ class Winner:
 class WinnerTakesAll:
     """Search for the largest of a sequence of score images at each pixel, with the scores before and after it."""
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
+    def __init__(self, shape: tuple[int, int]) -> None:
         self._count = 0
-        self._hypothesis = np.full(shape, -2, dtype=np.int32)
-        self._best, self._before, self._after, self._last = (np.full(shape, -2.0, np.float32) for _ in range(4))
+        self._hypothesis, self._best = np.zeros(shape, dtype=np.int32), np.full(shape, _UNSEEN)
+        self._before, self._after, self._last = (np.full(shape, -2.0, np.float32) for _ in range(3))
 
-    def add(self, score: Float32Array) -> None:
-        """Take the scores (H, W) of the next hypothesis."""
-        images = (score, self._last, self._best, self._before, self._after, self._hypothesis)
-        keep_winner(self._count, *(image.reshape(-1) for image in images))
+    def add(self, score: Float32Array, seen: BoolArray, first: int = 0) -> None:
+        """Take the scores (h, W) of the next hypothesis in the rows from `first` on, where it is `seen` (H, W)."""
+        images = (self._last, self._best, self._before, self._after, self._hypothesis)
+        keep_winner(self._count, first, score, seen, *images)
         self._count += 1
 
     def winner(self) -> Winner:

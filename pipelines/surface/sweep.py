@@ -13,7 +13,15 @@ import numpy as np
 from pipelines.core.types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from pipelines.geometry.cameras import ViewPose
 from pipelines.geometry.network import Network
-from pipelines.surface.matching import UNSEEN, Matcher, MatchSettings, StereoView, Winner, WinnerTakesAll
+from pipelines.surface.matching import (
+    UNSEEN,
+    Matcher,
+    MatchSettings,
+    StereoView,
+    Winner,
+    WinnerTakesAll,
+    is_hypothesis,
+)
 
 _ROWS = 8  # strips begin and end at multiples of this number
 _CLEARLY = 0.05  # of the score: margin by which planes of another direction must fit better than the first
@@ -42,18 +50,19 @@ class NormalMap:
 
     def offset_per_metre(self, camera: ViewPose) -> FloatArray:
         """Return the offset (H, W) that a camera's ray gains by a metre of depth."""
-        return np.asarray(np.einsum("hwi,hwi->hw", camera.rays(), self.normal_in_model))
+        return np.asarray(np.choose(self.index, np.moveaxis(camera.rays() @ self.normals_in_model.T, -1, 0)))
 
     def depth(self, camera: ViewPose, offset_m: Float32Array) -> FloatArray:
         """Return depths (H, W) along the optical axis at which a camera's rays meet planes of offsets (H, W)."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(
-                (offset_m - self.normal_in_model @ camera.center_in_model) / self.offset_per_metre(camera)
-            )
+            return np.asarray((offset_m - self._offset_of(camera)) / self.offset_per_metre(camera))
 
     def offset(self, camera: ViewPose, depth: Float32Array) -> FloatArray:
         """Return offsets (H, W) of the points at depths (H, W) of a camera: inverts `depth`."""
-        return self.normal_in_model @ camera.center_in_model + depth * self.offset_per_metre(camera)
+        return self._offset_of(camera) + depth * self.offset_per_metre(camera)
+
+    def _offset_of(self, camera: ViewPose) -> FloatArray:
+        return np.asarray((self.normals_in_model @ camera.center_in_model)[self.index])
 
 
 @dataclass(frozen=True)
@@ -110,12 +119,8 @@ def _sweep(camera: ViewPose, planes: SweepPlanes, matcher: Matcher, support_px: 
     shape = (camera.pinhole.height, camera.pinhole.width)
     search = WinnerTakesAll(shape)
     for depth, visible in _scene_on_planes(planes, camera):
-        score = np.full(shape, UNSEEN, np.float32)
-        if visible.any():
-            rows = _row_range(visible, support_px)
-            score[rows] = matcher(depth, rows)
-            score[~visible] = UNSEEN
-        search.add(score)
+        rows = _row_range(visible, support_px)
+        search.add(matcher(depth, rows), visible, rows.start)
     winner = search.winner()
     offset_m = np.interp(winner.hypothesis, np.arange(len(planes.offset_m)), planes.offset_m)
     offset_m[winner.score <= UNSEEN] = np.nan
@@ -127,21 +132,23 @@ def _sweep(camera: ViewPose, planes: SweepPlanes, matcher: Matcher, support_px: 
 def _scene_on_planes(planes: SweepPlanes, camera: ViewPose) -> Iterator[tuple[Float32Array, BoolArray]]:
     """Yield for each plane its depth (H, W), and the mask (H, W) of the pixels that see the scene on it."""
     rays, center = camera.rays(), camera.center_in_model
-    along, (lowest, highest) = rays @ planes.normal_in_model, planes.height_m
-    with np.errstate(divide="ignore"):
-        per_gap = (1 / along).astype(np.float32)
-    rise = rays[..., 2].astype(np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        per_gap = (1 / (rays @ planes.normal_in_model)).astype(np.float32)
+        ends = (np.array(planes.height_m) - center[2]) / rays[..., 2:]
+    nearest, furthest = ends.min(axis=-1).astype(np.float32), ends.max(axis=-1).astype(np.float32)
     for gap in planes.offset_m - planes.normal_in_model @ center:
         depth = np.float32(gap) * per_gap
-        height = np.float32(center[2]) + depth * rise
-        yield depth, (depth > 0) & (height >= lowest) & (height <= highest)
+        yield depth, is_hypothesis(depth) & (depth >= nearest) & (depth <= furthest)
 
 
 def _row_range(visible: BoolArray, around_px: int) -> slice:
-    """Return the rows with a visible pixel, widened by `around_px`."""
-    rows = np.flatnonzero(visible.any(axis=1))
-    first, last = rows[0] - around_px, rows[-1] + 1 + around_px
-    return slice(max(int(first) // _ROWS * _ROWS, 0), min(-int(-last // _ROWS) * _ROWS, len(visible)))
+    """Return the rows with a visible pixel, widened by `around_px`; none if no pixel is."""
+    flat, width = visible.reshape(-1), visible.shape[1]
+    start = int(flat.argmax())
+    if not flat[start]:
+        return slice(0, 0)
+    first, last = start // width - around_px, (flat.size - 1 - int(flat[::-1].argmax())) // width + 1 + around_px
+    return slice(max(first // _ROWS * _ROWS, 0), min(-(-last // _ROWS) * _ROWS, len(visible)))
 
 
 def sweep_result(

@@ -23,7 +23,8 @@ from pipelines.splat.optimizer import GaussianAdam
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.surface.agreement import agreed_depth
-from pipelines.surface.matching import MatchSettings, StereoView
+from pipelines.surface.depth_maps import LEVELS
+from pipelines.surface.matching import StereoView
 from pipelines.surface.sweep import SweepPlanes, plane_sweep
 
 _PATIENCE_S = 600.0
@@ -106,9 +107,13 @@ def _render() -> None:
 
 def _match() -> None:
     """Sweep planes through two views of a textured ground, and compare their depths."""
-    grey = np.random.default_rng(0).uniform(1, 255, (_HEIGHT, _WIDTH)).astype(np.float32)
+    grey = np.random.default_rng(0).integers(1, 256, (_HEIGHT, _WIDTH), dtype=np.uint8)
     pinhole = Pinhole(_WIDTH, _HEIGHT, 40.0, 40.0, 24.0, 16.0)
     views = [StereoView(ViewPose(pinhole, _DOWN, np.array([east, 0.0, 10.0])), grey) for east in (0.0, 1.0)]
     planes = [SweepPlanes(np.array([0.0, 0.0, 1.0]), np.linspace(-1, 1, 4))]
-    sweeps = [plane_sweep(one, [other], planes, MatchSettings()) for one, other in (views, views[::-1])]
-    agreed_depth(sweeps[0], sweeps[1:])
+    sweeps = [
+        plane_sweep(one, [other], planes, match)
+        for match in (level.settings for level in LEVELS)
+        for one, other in (views, views[::-1])
+    ]
+    agreed_depth(sweeps[0], sweeps[1:2])
