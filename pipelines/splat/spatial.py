@@ -5,6 +5,7 @@ random order.
 """
 
 import math
+from functools import cache
 
 import numpy as np
 import torch
@@ -67,6 +68,9 @@ class SpatialBlocks:
         order = _order(means, reach)
         self._row, self._count = usable[order].numpy(), len(order)
         self._values = {name: np.ascontiguousarray(values) for name, values in gaussians.arrays().items()}
+        self._harmonics = cache(
+            lambda degree: np.ascontiguousarray(self._values["sh"][:, : coefficient_count(degree)])
+        )
         blocks = -(-self._count // _BLOCK)
         padded = np.minimum(np.arange(blocks * _BLOCK), max(self._count - 1, 0)).reshape(blocks, _BLOCK)
         places, reaches = means[order].numpy()[padded], reach[order].numpy()[padded]
@@ -81,9 +85,9 @@ class SpatialBlocks:
         blocks = self._blocks_in(cam_from_model, camera, settings)
         chosen = blocks[:, None] * _BLOCK + np.arange(_BLOCK)
         rows = np.sort(self._row[chosen[chosen < self._count]])
-        values = self._values | {"sh": self._values["sh"][:, : coefficient_count(settings.sh_degree)]}
+        values = self._values | {"sh": self._harmonics(settings.sh_degree)}
         # By numpy: torch would wake all its threads for a few thousand rows.
-        return Gaussians(**{name: torch.from_numpy(array[rows]) for name, array in values.items()})
+        return Gaussians(**{name: torch.from_numpy(array.take(rows, axis=0)) for name, array in values.items()})
 
     def count_shown(self, cam_from_model: FloatArray, camera: Pinhole, settings: RasterSettings) -> int:
         """Return how many Gaussians `shown` returns, but for the last block's, without gathering them."""
