@@ -91,6 +91,13 @@ class Pinhole:
         sx, sy = width / self.width, height / self.height
         return Pinhole(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
+    def slopes(self) -> tuple[FloatArray, FloatArray]:
+        """Return x/z (W,) of the columns and y/z (H,) of the rows, at the centres of pixels."""
+        return (
+            (np.arange(self.width) + 0.5 - self.cx) / self.fx,
+            (np.arange(self.height) + 0.5 - self.cy) / self.fy,
+        )
+
     def rays(self, xy_px: ArrayLike) -> FloatArray:
         """Return viewing rays (…, 3) of pixels (…, 2) in the camera frame, with z = 1."""
         slope = (np.asarray(xy_px, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
@@ -124,10 +131,13 @@ class ViewPose:
 
     def rays(self) -> FloatArray:
         """Return viewing rays (H, W, 3) along the axes of `model`, of length one along the optical axis."""
-        pinhole, (right, down, ahead) = self.pinhole, self.cam_from_model
-        x = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
-        y = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
+        (x, y), (right, down, ahead) = self.pinhole.slopes(), self.cam_from_model
         return np.asarray(y[:, None, None] * down + (x[:, None] * right + ahead))
+
+    def rays_along(self, direction_in_model: FloatArray) -> FloatArray:
+        """Return the components (H, W) of the `rays` along a direction (3,)."""
+        (x, y), (right, down, ahead) = self.pinhole.slopes(), self.cam_from_model @ direction_in_model
+        return np.asarray(y[:, None] * down + (x * right + ahead))
 
 
 def pose_matrix(cam_from_world: FloatArray, cam_center_in_world: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ therefore keep out.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -213,7 +214,7 @@ def match_rows(
         reference: (H, W + 2 half) grey levels, mirrored at the ends of rows; half = window // 2.
         mean: (H, W) of the reference's windows.
         inverse_sigma: (H, W) of the reference's windows.
-        quads: (n, h, w) grey levels of the neighbours, as `_quads` packs them.
+        quads: (n, h, w) grey levels of the neighbours, as `StereoView` packs them.
         sizes: (n, 2) largest column and row of each neighbour, float32.
         per_depth: (n, 3, 3) float32, starts: (n, 3) float32: of a pixel (column, row) at depth d, the neighbour's
             homogeneous pixel is d · per_depth · (column, row, 1) + start.
@@ -296,6 +297,16 @@ class StereoView:
     camera: ViewPose
     grey: ByteArray
 
+    @cached_property
+    def quads(self) -> NDArray[np.uint32]:
+        """Grey levels (H, W) of four pixels in a number: of this one in the lowest byte, the next, the two below.
+
+        Interpolation then reads one place of the memory instead of four. Beyond the photograph are zeros.
+        """
+        grey = np.pad(self.grey, ((0, 1), (0, 1))).astype(np.uint32)
+        pairs = grey[:, :-1] | grey[:, 1:] << 8
+        return np.asarray(pairs[:-1] | pairs[1:] << 16)
+
 
 def camera_matrix(camera: Pinhole, offset_px: float = 0.0) -> FloatArray:
     """Return the camera matrix (3, 3); OpenCV counts pixels from the centre of the first, an offset of 0.5."""
@@ -330,7 +341,7 @@ class Matcher:
         self._inverse_sigma = (1 / np.sqrt(np.maximum(variance, NOISE_VARIANCE))).astype(np.float32)
         half = settings.window_px // 2
         self._mirrored = np.pad(grey, ((0, 0), (half, half)), mode="symmetric")
-        self._quads, self._sizes = _quads([view.grey for view in neighbours])
+        self._quads, self._sizes = _stacked([view.quads for view in neighbours])
         self._per_depth, self._starts = _projections(reference, neighbours)
         self._mean_of_best = np.empty(grey.shape, np.float32)
         self._guided: tuple[slice, cv2.ximgproc.GuidedFilter] | None = None
@@ -365,19 +376,13 @@ def is_hypothesis(depth: Float32Array) -> BoolArray:
     return np.asarray((depth > 0) & (depth < _FURTHEST_M))
 
 
-def _quads(images: list[ByteArray]) -> tuple[NDArray[np.uint32], Float32Array]:
-    """Return images in one array (n, h, w), and the largest column and row (n, 2) of each.
-
-    A number holds the grey levels of four pixels, from the lowest byte: this one, the next of its row, and the two
-    below. Interpolation then reads one place of the memory instead of four. Beyond an image are zeros.
-    """
+def _stacked(images: list[NDArray[np.uint32]]) -> tuple[NDArray[np.uint32], Float32Array]:
+    """Return images in one array (n, h, w), and the largest column and row (n, 2) of each."""
     height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
-    greys = np.zeros((len(images), height + 1, width + 1), np.uint32)
-    for grey, image in zip(greys, images, strict=True):
-        grey[: image.shape[0], : image.shape[1]] = image
-    upper = greys[:, :, :-1] | greys[:, :, 1:] << 8
-    sizes = np.array([[image.shape[1] - 1, image.shape[0] - 1] for image in images], np.float32)
-    return upper[:, :-1] | upper[:, 1:] << 16, sizes
+    stacked = np.zeros((len(images), height, width), np.uint32)
+    for whole, image in zip(stacked, images, strict=True):
+        whole[: image.shape[0], : image.shape[1]] = image
+    return stacked, np.array([[image.shape[1] - 1, image.shape[0] - 1] for image in images], np.float32)
 
 
 def _projections(reference: StereoView, neighbours: list[StereoView]) -> tuple[Float32Array, Float32Array]:

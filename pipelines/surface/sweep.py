@@ -50,7 +50,7 @@ class NormalMap:
 
     def offset_per_metre(self, camera: ViewPose) -> FloatArray:
         """Return the offset (H, W) that a camera's ray gains by a metre of depth."""
-        return np.asarray(np.choose(self.index, np.moveaxis(camera.rays() @ self.normals_in_model.T, -1, 0)))
+        return np.asarray(np.choose(self.index, [camera.rays_along(normal) for normal in self.normals_in_model]))
 
     def depth(self, camera: ViewPose, offset_m: Float32Array) -> FloatArray:
         """Return depths (H, W) along the optical axis at which a camera's rays meet planes of offsets (H, W)."""
@@ -131,10 +131,10 @@ def _sweep(camera: ViewPose, planes: SweepPlanes, matcher: Matcher, support_px: 
 
 def _scene_on_planes(planes: SweepPlanes, camera: ViewPose) -> Iterator[tuple[Float32Array, BoolArray]]:
     """Yield for each plane its depth (H, W), and the mask (H, W) of the pixels that see the scene on it."""
-    rays, center = camera.rays(), camera.center_in_model
+    center = camera.center_in_model
     with np.errstate(divide="ignore", invalid="ignore"):
-        per_gap = (1 / (rays @ planes.normal_in_model)).astype(np.float32)
-        ends = (np.array(planes.height_m) - center[2]) / rays[..., 2:]
+        per_gap = (1 / camera.rays_along(planes.normal_in_model)).astype(np.float32)
+        ends = (np.array(planes.height_m) - center[2]) / camera.rays_along(_UP)[..., None]
     nearest, furthest = ends.min(axis=-1).astype(np.float32), ends.max(axis=-1).astype(np.float32)
     for gap in planes.offset_m - planes.normal_in_model @ center:
         depth = np.float32(gap) * per_gap
