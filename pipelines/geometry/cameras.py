@@ -93,10 +93,9 @@ class Pinhole:
 
     def slopes(self) -> tuple[FloatArray, FloatArray]:
         """Return x/z (W,) of the columns and y/z (H,) of the rows, at the centres of pixels."""
-        return (
-            (np.arange(self.width) + 0.5 - self.cx) / self.fx,
-            (np.arange(self.height) + 0.5 - self.cy) / self.fy,
-        )
+        x = (np.arange(self.width, dtype=np.float64) + 0.5 - self.cx) / self.fx
+        y = (np.arange(self.height, dtype=np.float64) + 0.5 - self.cy) / self.fy
+        return np.asarray(x), np.asarray(y)
 
     def rays(self, xy_px: ArrayLike) -> FloatArray:
         """Return viewing rays (…, 3) of pixels (…, 2) in the camera frame, with z = 1."""
