@@ -23,10 +23,21 @@ import torch
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from pipelines.core.types import Float32Array, FloatArray, IntArray
+from pipelines.core.types import (
+    Array34,
+    ArrayN,
+    ArrayNK,
+    ArrayNK3,
+    AutogradContext,
+    Float32Array,
+    FloatArray,
+    IntArray,
+)
 from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.statistics import cauchy_weight, median_chi2
+from pipelines.splat.kernel_cache import kernel
 
 _FIRST_RATE, _LAST_RATE = 5e-3, 5e-4
 VIGNETTING_TERMS = 3  # of r², r⁴, r⁶
@@ -101,9 +112,12 @@ class Exposures:
         leaf = self.affine[index].clone().requires_grad_()
         falloff = self.vignetting[self._lens[index]].clone().requires_grad_()
         self._used = (index, leaf, falloff)
-        if radius2 is not None:
-            colour = with_vignetting(colour, radius2, falloff)
-        return with_affine(colour, leaf)
+        if radius2 is None:
+            return with_affine(colour, leaf)
+        if colour.device.type == "cpu" and colour.dtype == radius2.dtype == leaf.dtype:
+            shown: Tensor = _Exposed.apply(colour, radius2, leaf, falloff)  # type: ignore[no-untyped-call]
+            return shown
+        return with_affine(with_vignetting(colour, radius2, falloff), leaf)
 
     def step(self, iteration: int) -> None:
         """Change the exposure and the lens that `apply` used last, and restore the mean over the images."""
@@ -157,6 +171,91 @@ class FrozenExposures:
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Accept the state of `state`, which is empty."""
+
+
+class _Exposed(torch.autograd.Function):
+    """`with_affine` of `with_vignetting` on a CPU: one pass over the pixels in place of forty."""
+
+    @staticmethod
+    def forward(
+        ctx: AutogradContext, colour: Tensor, radius2: Tensor, affine: Tensor, coefficients: Tensor
+    ) -> Tensor:
+        inputs = [tensor.contiguous() for tensor in (colour, radius2, affine, coefficients)]
+        ctx.save_for_backward(*inputs)
+        shown = torch.empty_like(inputs[0])
+        expose(*(tensor.detach().numpy() for tensor in inputs), shown.numpy())
+        return shown
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: AutogradContext, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        saved, gradient = ctx.saved_tensors, grad_outputs[0].contiguous()
+        of_colour, of_affine, of_falloff = (torch.empty_like(saved[index]) for index in (0, 2, 3))
+        outputs = (of_colour, of_affine, of_falloff)
+        expose_gradient(*(tensor.detach().numpy() for tensor in (*saved, gradient, *outputs)))
+        return of_colour, None, of_affine, of_falloff
+
+
+# ruff: noqa: PLR0917  (kernels take arrays, not objects)
+@kernel(nogil=True, error_model="numpy")
+def expose(
+    colour: ArrayNK3,  # (H, W, 3) float32/64
+    radius2: ArrayNK,  # (H, W) float32/64
+    affine: Array34,  # (3, 4) float32/64
+    coefficients: ArrayN,  # (terms,) float32/64
+    shown: ArrayNK3,  # (H, W, 3) float32/64
+) -> None:
+    """Write `with_affine` of `with_vignetting` of colours into `shown` (H, W, 3)."""
+    for row in range(colour.shape[0]):
+        for i in range(colour.shape[1]):
+            far = float(radius2[row, i])
+            light = 0.0
+            for k in range(coefficients.shape[0] - 1, -1, -1):
+                light = far * (light + coefficients[k])
+            light += 1.0
+            red, green, blue = light * colour[row, i, 0], light * colour[row, i, 1], light * colour[row, i, 2]
+            for c in range(3):
+                mixed = affine[c, 0] * red + affine[c, 1] * green + affine[c, 2] * blue
+                shown[row, i, c] = mixed + affine[c, 3]
+
+
+@kernel(nogil=True, error_model="numpy")
+def expose_gradient(
+    colour: ArrayNK3,  # (H, W, 3) float32/64
+    radius2: ArrayNK,  # (H, W) float32/64
+    affine: Array34,  # (3, 4) float32/64
+    coefficients: ArrayN,  # (terms,) float32/64
+    gradient: ArrayNK3,  # (H, W, 3) float32/64
+    of_colour: ArrayNK3,  # (H, W, 3) float32/64
+    of_affine: Array34,  # (3, 4) float32/64
+    of_coefficients: ArrayN,  # (terms,) float32/64
+) -> None:
+    """Write the gradients of colours, affine change and vignetting, given that of what `expose` writes."""
+    mixing, falling = np.zeros((3, 4)), np.zeros(len(coefficients))
+    for row in range(colour.shape[0]):
+        for i in range(colour.shape[1]):
+            far = float(radius2[row, i])
+            light = 0.0
+            for k in range(coefficients.shape[0] - 1, -1, -1):
+                light = far * (light + coefficients[k])
+            light += 1.0
+            red, green, blue = gradient[row, i, 0], gradient[row, i, 1], gradient[row, i, 2]
+            of_light = 0.0
+            for c in range(3):
+                back = affine[0, c] * red + affine[1, c] * green + affine[2, c] * blue
+                level = float(colour[row, i, c])
+                of_colour[row, i, c] = light * back
+                of_light += back * level
+                mixing[0, c] += red * light * level
+                mixing[1, c] += green * light * level
+                mixing[2, c] += blue * light * level
+            mixing[0, 3] += red
+            mixing[1, 3] += green
+            mixing[2, 3] += blue
+            for k in range(coefficients.shape[0]):
+                of_light *= far
+                falling[k] += of_light
+    of_affine[:], of_coefficients[:] = mixing, falling
 
 
 _Values = Any  # a number, an array or a tensor

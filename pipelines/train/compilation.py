@@ -16,6 +16,7 @@ from pipelines.core.json_values import JsonValue
 from pipelines.core.lock import WriteLock
 from pipelines.core.progress import SILENT, Progress
 from pipelines.geometry.cameras import Pinhole, ViewPose
+from pipelines.splat.exposure import Exposures
 from pipelines.splat.initialise import InitialisationOptions, gaussians_from_points
 from pipelines.splat.kernel_cache import cache_folder, compilation_stamp
 from pipelines.splat.losses import photometric_loss
@@ -98,8 +99,11 @@ def _render() -> None:
         optimizer.gaussians, pose, Pinhole(_WIDTH, _HEIGHT, 40.0, 40.0, 24.0, 16.0), RasterSettings(depth=True)
     )
     assert view.expected_depth is not None
+    exposures = Exposures(torch.eye(3, 4)[None], torch.zeros(1, dtype=torch.int64), iterations=2)
     loss = photometric_loss(
-        view.colour, torch.zeros_like(view.colour), torch.ones(_HEIGHT, _WIDTH, dtype=torch.bool)
+        exposures.apply(0, view.colour, torch.zeros(_HEIGHT, _WIDTH)),
+        torch.zeros_like(view.colour),
+        torch.ones(_HEIGHT, _WIDTH, dtype=torch.bool),
     )
     (loss + view.expected_depth.sum()).backward()
     optimizer.step(1, view.stats.visible)

@@ -83,6 +83,24 @@ def test_vignetting_of_each_lens_is_found_beside_the_exposures() -> None:
     assert float((shown - gain[0] * colour).abs().max()) < 0.01
 
 
+def test_the_kernel_has_values_and_gradients_of_the_plain_version() -> None:
+    draw = torch.Generator().manual_seed(3)
+    exposures = Exposures(torch.eye(3, 4) + 0.1 * torch.rand(4, 3, 4, generator=draw), TRAIN, 10)
+    exposures.vignetting.copy_(torch.tensor([[-0.3, 0.1, -0.05]]))
+    camera = Pinhole(16, 12, 15.0, 15.0, 8.5, 5.5)
+    radius2, weight = squared_radius(camera, camera, CPU), torch.rand(12, 16, 3, generator=draw)
+    colours = [picture().requires_grad_() for _ in range(2)]
+    leaves = [exposures.affine[1].clone().requires_grad_(), exposures.vignetting[0].clone().requires_grad_()]
+    plain = with_affine(with_vignetting(colours[0], radius2, leaves[1]), leaves[0])
+    shown = exposures.apply(1, colours[1], radius2)
+    torch.testing.assert_close(shown, plain)
+    for image in (plain, shown):
+        (weight * image.square()).sum().backward()
+    assert exposures._used is not None
+    for one, other in zip((colours[0], *leaves), (colours[1], *exposures._used[1:]), strict=True):
+        torch.testing.assert_close(other.grad, one.grad)
+
+
 def test_a_state_continues_exactly() -> None:
     def run(exposures: Exposures, first: int, last: int) -> None:
         for iteration in range(first, last):
