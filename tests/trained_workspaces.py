@@ -110,7 +110,7 @@ def untrained(workspace: Workspace) -> None:
 
 
 def own_copy(workspace: Workspace, root: Path) -> Workspace:
-    """Return a copy with a cache of its own; those of one flight share theirs, which serves one process at a time."""
+    """Return a copy with a cache of its own: those of one flight share theirs, which serves one process alone."""
     shutil.copytree(workspace.root, root, symlinks=True)
     (root / "cache").unlink()
     (root / "cache").mkdir()
