@@ -80,6 +80,8 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", help="names of flights (default: all)")
     parser.add_argument("--page", type=Path, metavar="DOCS", help="folder of documents to write the page into")
     arguments = parser.parse_args()
+    # The program runs in the repository's folder.
+    arguments.data, arguments.out = arguments.data.absolute(), arguments.out.absolute()
     flights = [
         Flight(name, **row) for name, row in tomllib.loads((HERE / "flights.toml").read_text("utf-8")).items()
     ]
