@@ -26,7 +26,6 @@ from pipelines.splat.gaussians import read_gaussians
 from pipelines.splat.rasterizer.api import RasterSettings
 from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.survey.navigation import load_survey
-from pipelines.survey.photographs import Pinholes
 from pipelines.survey.scene import photographs
 from pipelines.survey.solution import Solution, read_sfm, read_trained
 from pipelines.survey.survey import Fix, SurveyImage
@@ -69,7 +68,6 @@ def main() -> None:
     registered = [(image, image.fix) for image in survey.images if image.name in number and image.fix is not None]
     chosen = registered[:: max(1, len(registered) // options.images)][: options.images]
     images = photographs(solution.with_lenses(sfm), survey, workspace, options.size)
-    pinholes = Pinholes(images)
     gaussians, backend = read_gaussians(options.splat), rasterizer("auto")
     options.output.mkdir(parents=True, exist_ok=True)
     for image, fix in chosen:
@@ -77,7 +75,7 @@ def main() -> None:
         rotation = geo_from_cam(image, index, solution, options.attitude == "recorded")
         pose = cam_from_ply(fix, rotation, survey.origin_on_earth, options.splat)
         with torch.no_grad():
-            render = backend.render(gaussians, pose, pinholes.of(index), RasterSettings())
+            render = backend.render(gaussians, pose, images.pinhole(index), RasterSettings())
         colour = render.colour.clamp(0, 1).mul(255).byte().numpy()
         strip = np.concatenate([images.image(index), colour], axis=1)
         path = options.output / f"{Path(image.name).stem}.png"

@@ -42,7 +42,6 @@ from pipelines.survey.area import corners, scene_points
 from pipelines.survey.headline import headline_of
 from pipelines.survey.navigation import load_survey
 from pipelines.survey.options import CrsOptions
-from pipelines.survey.photographs import Pinholes
 from pipelines.survey.scene import photographs
 from pipelines.survey.solution import TrainedModel, read_sfm, read_trained
 from pipelines.survey.survey import Survey
@@ -150,7 +149,6 @@ class _Photographs:
     def __init__(self, workspace: Workspace, model: TrainedModel, sfm: SparseModel, survey: Survey) -> None:
         largest = max(max(camera.width, camera.height) for camera in sfm.cameras.values())
         self._model, self._images = model, photographs(model.with_lenses(sfm), survey, workspace, largest)
-        self._pinholes = Pinholes(self._images)
 
     def steepest(
         self, place: FloatArray, cell_m: float, shape: tuple[int, int], hidden: Callable[[FloatArray], bool]
@@ -164,7 +162,7 @@ class _Photographs:
         in_model, middle = geo_from_model.inverse().apply(place), place.mean(axis=0)
         for camera in model.indices("train"):
             center = poses.cam_center_in_model[camera]
-            pinhole = self._pinholes.of(camera)
+            pinhole = self._images.pinhole(camera)
             pixel = pinhole.project((in_model - center) @ poses.cam_from_model[camera].T)
             if not pinhole.contains(pixel).all():
                 continue
@@ -245,7 +243,7 @@ def opacity(workspace: Workspace) -> Opacity:
         pose = torch.from_numpy(pose_matrix(rotation, center)).float()
         exposure = model.cameras[camera].exposure
         with torch.no_grad():
-            render = backend.render(gaussians, pose, renderer.pinholes.of(camera), RasterSettings())
+            render = backend.render(gaussians, pose, renderer.images.pinhole(camera), RasterSettings())
         over = []
         for background in (0.0, 1.0):
             colour = render.colour + background * (1 - render.alpha)[..., None]

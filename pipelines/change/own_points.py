@@ -14,7 +14,7 @@ import shapely
 from pipelines.adjust.relative import Solved
 from pipelines.change.datum import Epoch
 from pipelines.change.grid import CommonGrid, EpochRasters
-from pipelines.change.tied import Surfaces
+from pipelines.change.tied import Surfaces, least_of_witness_m
 from pipelines.core.types import FloatArray
 from pipelines.formats.geotiff import sampled_raster
 from pipelines.geodesy.crs import PointCrs
@@ -64,7 +64,7 @@ def contradicted_by_own_points(
     before, after = (_compared(*date, grid.crs, near) for date in zip(grid.rasters, grid.epochs, strict=True))
 
     def is_contradicted(index: int) -> bool:
-        polygon, least_m = polygons[index], _HALF * abs(regions[index].net_m3) / regions[index].area_m2
+        polygon, least_m = polygons[index], least_of_witness_m(regions[index])
         return after.explain(polygon, surfaces, 1.0, least_m) or before.explain(polygon, surfaces, -1.0, least_m)
 
     return tuple(index for index in found if is_contradicted(index))

@@ -140,13 +140,18 @@ def contradicted(
     for index, (region, polygon) in enumerate(zip(regions, polygons, strict=True)):
         if not region.name.startswith("R"):
             continue
-        least_m = _HALF * abs(region.net_m3) / region.area_m2
+        least_m = least_of_witness_m(region)
         shares = [_contradicted_share(step, polygon, surfaces, least_m) for step in tied.steps]
         if min(shares) >= _HALF:
             whole.append(index)
         elif min(shares) > 0:
             part.append(index)
     return Contradicted(tuple(whole), tuple(part))
+
+
+def least_of_witness_m(region: ChangedRegion) -> float:
+    """Return by how much surfaces differ at a witness: half of the region's mean change, in metres."""
+    return _HALF * abs(region.net_m3) / region.area_m2
 
 
 def _contradicted_share(step: Step, polygon: shapely.Geometry, surfaces: Surfaces, least_m: float) -> float:

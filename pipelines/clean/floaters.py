@@ -120,7 +120,7 @@ def evidence_of(renderer: ModelRenderer, backend: Rasterizer, views: list[int], 
     weight, error = torch.zeros(2, len(gaussians), device=backend.device)
     with progress.task("evidence of the views", len(views)) as task:
         for index in views:
-            pose, camera = _pose(renderer, index).to(backend.device), renderer.pinholes.of(index)
+            pose, camera = _pose(renderer, index).to(backend.device), renderer.images.pinhole(index)
             none = torch.zeros(camera.height, camera.width, device=backend.device)
             weight += view_contributions(gaussians, pose, camera, none, backend).weight_px
             error += _error_by_opacity(renderer, backend, index, pose)
@@ -141,7 +141,7 @@ def _error_by_opacity(renderer: ModelRenderer, backend: Rasterizer, index: int, 
     photo, mask = (values.to(backend.device) for values in photograph_and_mask(renderer, index))
     settings = RasterSettings(model.sh_degree, model.background)
     with torch.enable_grad():
-        render = backend.render(gaussians, pose, renderer.pinholes.of(index), settings)
+        render = backend.render(gaussians, pose, renderer.images.pinhole(index), settings)
         difference = through_lens(renderer, index, render.colour) - photo
         error = (difference.square().sum(dim=2) * mask).sum()
         (by_logit,) = torch.autograd.grad(error, gaussians.logit_opacities)

@@ -134,7 +134,7 @@ def _estimate(renderer: ModelRenderer, options: MeasurableOptions) -> str | None
     discs = round(ConvexHull(ground).volume / spacing_m**2)
     count = discs + round(_KEPT_SHARE * len(gaussians))
     size_bytes = count * 4 * (_PLY_VALUES + 3 * coefficient_count(gaussians.sh_degree))
-    pixels = [pinhole.width * pinhole.height for pinhole in map(renderer.pinholes.of, cameras)]
+    pixels = [pinhole.width * pinhole.height for pinhole in map(renderer.images.pinhole, cameras)]
     pass_s = iteration_seconds(float(np.mean(pixels)), count, len(cameras), surface=False)  # over one view
     passes: float | None = options.appearance_passes
     if passes is None:

@@ -31,7 +31,7 @@ from pipelines.geometry.cameras import Pinhole
 from pipelines.geometry.sparse_model import SparseModel
 from pipelines.splat.exposure import falloff, squared_radius_at
 from pipelines.surface.surface_views import SurfaceView
-from pipelines.survey.photographs import ImageCache, Pinholes
+from pipelines.survey.photographs import ImageCache
 from pipelines.survey.solution import TrainedModel
 
 BLOCK = 8  # cells along a side of a block, of which broad colours are means
@@ -198,7 +198,6 @@ class PhotoColours:
         pictures: Pictures,
     ) -> None:
         self._source, self._images, self._pictures = source, images, pictures
-        self._pinholes = Pinholes(images)
         self._views: dict[int, _View] = {}
 
     def window(self, frame: RasterFrame, first: tuple[int, int], height: FloatArray) -> CellColours:
@@ -382,7 +381,7 @@ class PhotoColours:
             seen = self._source.views.view(number)
             self._views[number] = _View(
                 seen,
-                self._pinholes.of(seen.camera),
+                self._images.pinhole(seen.camera),
                 self._sharpness(number),
                 0.0 if self._images.is_masked(seen.camera) else _UNKNOWN,  # what is masked has no depth either
             )

@@ -165,7 +165,7 @@ def _viewpoints(renderer: ModelRenderer, moved: Similarity | None) -> Viewpoints
     return Viewpoints(
         poses.cam_from_model[cameras] @ similarity.rotation.T,
         similarity.apply(poses.cam_center_in_model[cameras]),
-        tuple(renderer.pinholes.of(index) for index in cameras),
+        tuple(renderer.images.pinhole(index) for index in cameras),
     )
 
 

@@ -41,7 +41,7 @@ def surface_heights(
     surveyed = np.array([point.position_in_geo for point in points])
     center = renderer.model.center_in_geo
     arm_m = np.linalg.norm(center[None] - surveyed[:, None], axis=2)
-    focal_px = np.array([renderer.pinholes.of(camera).fx for camera in range(len(center))])
+    focal_px = np.array([renderer.images.pinhole(camera).fx for camera in range(len(center))])
     pixel_m = float(np.median((arm_m / focal_px).min(axis=1)))  # of the most detailed view
     around_m = max(_AROUND_PX * pixel_m, _LEAST_AROUND_M)
     steps = around_m * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])

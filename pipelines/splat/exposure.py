@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numba import njit
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
@@ -197,6 +198,18 @@ class _Exposed(torch.autograd.Function):
 
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
+@njit(nogil=True, error_model="numpy", inline="always")
+def _light(
+    far: float,
+    coefficients: ArrayN,  # (terms,) float32/64
+) -> float:
+    """Return the share of the light at a squared radius."""
+    light = 0.0
+    for k in range(coefficients.shape[0] - 1, -1, -1):
+        light = far * (light + coefficients[k])
+    return light + 1.0
+
+
 @kernel(nogil=True, error_model="numpy")
 def expose(
     colour: ArrayNK3,  # (H, W, 3) float32/64
@@ -209,10 +222,7 @@ def expose(
     for row in range(colour.shape[0]):
         for i in range(colour.shape[1]):
             far = float(radius2[row, i])
-            light = 0.0
-            for k in range(coefficients.shape[0] - 1, -1, -1):
-                light = far * (light + coefficients[k])
-            light += 1.0
+            light = _light(far, coefficients)
             red, green, blue = light * colour[row, i, 0], light * colour[row, i, 1], light * colour[row, i, 2]
             for c in range(3):
                 mixed = affine[c, 0] * red + affine[c, 1] * green + affine[c, 2] * blue
@@ -235,10 +245,7 @@ def expose_gradient(
     for row in range(colour.shape[0]):
         for i in range(colour.shape[1]):
             far = float(radius2[row, i])
-            light = 0.0
-            for k in range(coefficients.shape[0] - 1, -1, -1):
-                light = far * (light + coefficients[k])
-            light += 1.0
+            light = _light(far, coefficients)
             red, green, blue = gradient[row, i, 0], gradient[row, i, 1], gradient[row, i, 2]
             of_light = 0.0
             for c in range(3):

@@ -133,7 +133,7 @@ def measured_by(renderer: ModelRenderer, progress: Progress = SILENT) -> Measure
     depth_m, focal_px = depths_of_observations(renderer.model, renderer.sfm)
     photo_m = float(np.median(depth_m / focal_px)) if len(depth_m) else 1.0
     longest_px = min(_LONGEST_PX, int((_MOST_PIXELS / max(len(cameras), 1)) ** 0.5))
-    pinholes = tuple(renderer.pinholes.of(index).limited(longest_px) for index in cameras)
+    pinholes = tuple(renderer.images.pinhole(index).limited(longest_px) for index in cameras)
     maps = []
     with progress.task("measured ground", len(cameras)) as task:
         for index, pinhole in zip(cameras, pinholes, strict=True):
@@ -150,7 +150,7 @@ def measured_by(renderer: ModelRenderer, progress: Progress = SILENT) -> Measure
         return MeasuredGround(np.zeros((1, 1), dtype=bool), np.zeros(2), np.array([photo_m, photo_m]))
     pixel_m = float(np.median(widths))
     reduced = [
-        small.width / renderer.pinholes.of(index).width for index, small in zip(cameras, pinholes, strict=True)
+        small.width / renderer.images.pinhole(index).width for index, small in zip(cameras, pinholes, strict=True)
     ]
     training_m = pixel_m * float(np.median(reduced))
     points = []

@@ -14,7 +14,7 @@ from pipelines.surface.surface_views import ModelRenderer
 
 def through_lens(renderer: ModelRenderer, index: int, colour: Tensor) -> Tensor:
     """Return colours (H, W, 3) of a render as the lens and the exposure of its photograph show them."""
-    camera_id, pinhole = int(renderer.sparse.image_camera_id[index]), renderer.pinholes.of(index)
+    camera_id, pinhole = int(renderer.sparse.image_camera_id[index]), renderer.images.pinhole(index)
     lens = next((lens for lens in renderer.model.vignetting if lens.camera_id == camera_id), None)
     if lens is not None:
         radius2 = squared_radius(pinhole, pinhole, colour.device)

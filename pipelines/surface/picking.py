@@ -177,7 +177,7 @@ class SurfaceReader:
 
     def focal_px(self, camera: int) -> float:
         """Return the focal length of a camera's depth map."""
-        return self.renderer.pinholes.of(camera).fx
+        return self.renderer.images.pinhole(camera).fx
 
     def under(self, sight: Sight) -> SurfacePoint | NoSurface:
         """Return the point of the surface under a line of sight, or why there is none to measure.
@@ -245,7 +245,7 @@ class SurfaceReader:
         """Return the training cameras that hold a place in their image, the most detailed ones first."""
         detail = []
         for camera in self._train:
-            pinhole = self.renderer.pinholes.of(camera)
+            pinhole = self.renderer.images.pinhole(camera)
             in_cam = self._in_cam(camera, place)
             if pinhole.contains(pinhole.project(in_cam)):
                 detail.append((float(in_cam[2]) / pinhole.fx, camera))
@@ -304,7 +304,7 @@ class SurfaceReader:
 
     def _variance_of_rays(self, place: FloatArray, cameras: IntArray) -> float:
         arm = place - self.renderer.poses.cam_center_in_model[cameras]
-        return variance_of_rays(arm, np.array([self.renderer.pinholes.of(int(camera)).fx for camera in cameras]))
+        return variance_of_rays(arm, np.array([self.renderer.images.pinhole(int(camera)).fx for camera in cameras]))
 
 
 def variance_of_rays(arm: FloatArray, focal_px: FloatArray) -> float:

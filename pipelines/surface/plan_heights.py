@@ -117,7 +117,7 @@ def _readers(renderer: ModelRenderer, points: FloatArray, most_views: int) -> Bo
     in_model = renderer.geo_from_model.inverse().apply(points)
     detail = np.full((len(points), len(renderer.sparse.image_name)), np.inf)
     for camera in renderer.model.indices("train"):
-        pinhole = renderer.pinholes.of(camera)
+        pinhole = renderer.images.pinhole(camera)
         in_cam = (in_model - renderer.poses.cam_center_in_model[camera]) @ renderer.poses.cam_from_model[camera].T
         ahead = in_cam[:, 2] > 0
         pixel = pinhole.project(np.where(ahead[:, None], in_cam, [0.0, 0.0, 1.0]))
@@ -176,7 +176,7 @@ def _agreed(renderer: ModelRenderer, plan: FloatArray, height: FloatArray) -> Pl
     square = np.where(agree, (height - middle_of_place[:, None]) ** 2, 0.0).sum(axis=1) / number
     known = np.flatnonzero(np.isfinite(middle_of_place))
     sigma = np.full(len(plan), np.nan)
-    focal = np.array([renderer.pinholes.of(camera).fx for camera in range(len(centers))])
+    focal = np.array([renderer.images.pinhole(camera).fx for camera in range(len(centers))])
     for row in known:
         cameras = np.flatnonzero(agree[row])
         arm = np.append(plan[row], middle_of_place[row]) - centers[cameras]

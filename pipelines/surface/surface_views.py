@@ -32,7 +32,7 @@ from pipelines.splat.rasterizer.backends import rasterizer
 from pipelines.splat.spatial import SpatialBlocks
 from pipelines.splat.surface import measured_depth
 from pipelines.surface.visibility import DepthViews, Support, Viewpoints, support
-from pipelines.survey.photographs import ImageCache, Pinholes
+from pipelines.survey.photographs import ImageCache
 from pipelines.survey.scene import photographs
 from pipelines.survey.solution import TrainedModel
 from pipelines.survey.survey import Survey
@@ -75,7 +75,6 @@ class ModelRenderer:
         self.model, self.gaussians, self.images, self.backend = model, gaussians, images, backend
         self.sfm, self.sparse = sfm, model.with_lenses(sfm)
         self.poses, self.geo_from_model = model.poses, model.similarity
-        self.pinholes = Pinholes(images)
         self._on_device = gaussians.to(backend.device)
 
     def showing(self, gaussians: Gaussians) -> "ModelRenderer":
@@ -97,7 +96,7 @@ class ModelRenderer:
 
     def pose(self, index: int) -> ViewPose:
         poses = self.poses
-        return ViewPose(self.pinholes.of(index), poses.cam_from_model[index], poses.cam_center_in_model[index])
+        return ViewPose(self.images.pinhole(index), poses.cam_from_model[index], poses.cam_center_in_model[index])
 
     def render(
         self, view: int | ViewPose, *, depth: bool = False, window: Window | None = None, plain: bool = False
@@ -130,7 +129,7 @@ class ModelRenderer:
             digest.update(np.ascontiguousarray(values).data)
         for index in self.model.indices("train"):
             masked = self.images.mask_key(index) if self.images.is_masked(index) else ""
-            digest.update(f"{self.images.key(index)}|{masked}|{self.pinholes.of(index)}".encode())
+            digest.update(f"{self.images.key(index)}|{masked}|{self.images.pinhole(index)}".encode())
         return digest.hexdigest()[:32]
 
     def surface(self, index: int) -> tuple[Float32Array, ByteArray]:
@@ -209,7 +208,7 @@ class SurfaceViews:
         self.folder = folder
         self._model, self._poses, self._images = renderer.model, renderer.poses, renderer.images
         self.cameras = renderer.model.indices("train")
-        self.pinholes = tuple(renderer.pinholes.of(index) for index in self.cameras)
+        self.pinholes = tuple(renderer.images.pinhole(index) for index in self.cameras)
         pixels = [pinhole.width * pinhole.height for pinhole in self.pinholes]
         self._start = np.concatenate([[0], np.cumsum(pixels)]).astype(np.int64)
         folder.mkdir(parents=True, exist_ok=True)

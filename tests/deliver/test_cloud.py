@@ -52,8 +52,7 @@ def surface_views(folder: Path, offset_m: np.ndarray | float = 0.0) -> SurfaceVi
     renderer: Any = SimpleNamespace(
         model=SimpleNamespace(similarity=GEO_FROM_MODEL, indices=lambda _split: list(range(len(CENTERS)))),
         poses=poses,
-        images=None,
-        pinholes=SimpleNamespace(of=lambda _index: CAMERA),
+        images=SimpleNamespace(pinhole=lambda _index: CAMERA),
         surface=surface,
     )
     return SurfaceViews(renderer, folder, colours=True)

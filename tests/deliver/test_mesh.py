@@ -89,9 +89,8 @@ def surface_views(folder: Path, *, floater: bool = False) -> SurfaceViews:
     renderer: Any = SimpleNamespace(
         model=model,
         poses=poses,
-        pinholes=SimpleNamespace(of=lambda _index: CAMERA),
         surface=surface,
-        images=SimpleNamespace(image=photograph),
+        images=SimpleNamespace(image=photograph, pinhole=lambda _index: CAMERA),
     )
     return SurfaceViews(renderer, folder, colours=True)
 

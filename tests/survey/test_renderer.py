@@ -40,7 +40,7 @@ def test_render_is_the_photograph(renderer: ModelRenderer, index: int) -> None:
 
 @pytest.mark.parametrize("index", [0, 5])
 def test_depth_is_that_of_the_ground(renderer: ModelRenderer, index: int) -> None:
-    depth, camera, poses = renderer.depth_m(index), renderer.pinholes.of(index), renderer.poses
+    depth, camera, poses = renderer.depth_m(index), renderer.images.pinhole(index), renderer.poses
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
     place = (depth[..., None] * ray) @ poses.cam_from_model[index] + poses.cam_center_in_model[index]

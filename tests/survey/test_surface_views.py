@@ -30,8 +30,7 @@ class Renderer:
     def __init__(self, fails_at: int = -1) -> None:
         self.rendered: list[int] = []
         self.fails_at = fails_at
-        self.images: Any = None
-        self.pinholes = SimpleNamespace(of=lambda _index: CAMERA)
+        self.images: Any = SimpleNamespace(pinhole=lambda _index: CAMERA)
         poses = CameraPoses(np.tile(DOWN, (5, 1, 1)), np.array(CENTERS))
         self.poses = poses
         self.model = SimpleNamespace(
@@ -84,7 +83,7 @@ def test_unconfirmed_depths_are_left_out(tmp_path: Path) -> None:
     renderer = Renderer()
     pattern = np.full((CAMERA.height, CAMERA.width, 3), 100, np.uint8)
     pattern[:, :40:2] = 160
-    renderer.images = SimpleNamespace(image=lambda _index: pattern)
+    renderer.images.image = lambda _index: pattern
     depth = SurfaceViews(renderer, tmp_path, confirmed=True).view(0).depth_m  # type: ignore[arg-type]
     assert (depth[:, :32] == 0).all()
     np.testing.assert_array_equal(depth[:, 48:], depth_map(CENTERS[0])[:, 48:])
