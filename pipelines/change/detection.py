@@ -27,7 +27,7 @@ _LEAST_STABLE = 500  # cells
 _LEAST_PAIRS = 200
 _UNCORRELATED = 0.05
 _BLOCKS = 6  # along a side, whose medians show errors of long range
-_LEAST_IN_BLOCK = 50
+_LEAST_IN_BLOCK = 30
 _MAJORITY = 0.5  # of the neighbours that change in the same way
 _LEAST_VOTERS = 0.1  # of the neighbours
 _FLOOR_M2 = 1e-8
@@ -85,7 +85,7 @@ class Noise:
         scatter: of the cells over their predicted σ.
         correlated_m2: area over which errors of cells are one error.
         length_m: distance at which the correlation has fallen below 5 %.
-        long_range_m: σ of the errors that vary slowly over the scene.
+        long_range_m: σ of the errors that vary slowly over the scene, of which a region has one.
         cells, share: number of sampled cells that are unchanged, and their share of the ground that counts.
         lags_m, correlation: (L,) of the errors by distance.
     """
@@ -117,11 +117,14 @@ class Noise:
         return np.asarray(self.shift_m[2] - slope @ self.shift_m[:2] + place_m @ self.tilt)
 
 
-def unchanged_ground(samples: Samples, cell_m: float, prior_h_m: float, *, with_tilt: bool) -> Noise:
+def unchanged_ground(
+    samples: Samples, cell_m: float, prior_h_m: float, *, with_tilt: bool, slow_m: float = 0.0
+) -> Noise:
     """Return the errors of the difference on the ground that most of the samples show as unchanged.
 
     The later surface, shifted by t, is z₂(x) = z₁(x − t_h) + t_v: the difference is t_v − t_h·∇z (Nuth, Kääb 2011).
     What does not fit shift and noise has changed. `prior_h_m` keeps a horizontal shift small that no slope shows.
+    `slow_m` is the σ of slow errors that unchanged ground may hide, as both surfaces share them there.
 
     Raises:
         DegenerateGeometryError: too little ground is left, or both surfaces are one.
@@ -174,7 +177,15 @@ def unchanged_ground(samples: Samples, cell_m: float, prior_h_m: float, *, with_
         scatter=scale,
         correlated_m2=correlated_m2,
         length_m=length_m,
-        long_range_m=_long_range(samples.place_m[kept], residual_m, correlated_m2, area_m2),
+        long_range_m=max(
+            slow_error_m(
+                samples.place_m[kept],
+                residual_m,
+                np.ptp(samples.place_m[kept], axis=0) / _BLOCKS,
+                apart=min(independent / kept.sum(), 1.0),
+            ),
+            slow_m,
+        ),
         cells=int(kept.sum()),
         share=float(kept.sum() / ground.sum()),
         lags_m=lags_m,
@@ -216,17 +227,23 @@ def _correlated(lags_m: FloatArray, correlation: FloatArray, cell_m: float) -> t
     return max(area, cell_m**2), float(radius[-1]) if count else cell_m
 
 
-def _long_range(place_m: FloatArray, residual_m: FloatArray, correlated_m2: float, area_m2: float) -> float:
-    """Return the σ of slow errors: the scatter of the medians of large blocks beyond that of the noise of cells."""
-    low, size = place_m.min(axis=0), np.maximum(np.ptp(place_m, axis=0), 1e-9)
-    block = np.minimum((place_m - low) / size * _BLOCKS, _BLOCKS - 1).astype(np.int64) @ [1, _BLOCKS]
+def slow_error_m(place_m: FloatArray, error_m: FloatArray, block_m: FloatArray, *, apart: float = 1.0) -> float:
+    """Return the σ of errors that vary slowly: the scatter of the medians of blocks beyond that of their noise.
+
+    Args:
+        place_m: (K, 2)
+        error_m: (K,)
+        block_m: (2,) sides of a block.
+        apart: independent errors of a short range for each of the K.
+    """
+    column, row = ((place_m - place_m.min(axis=0)) // np.maximum(block_m, 1e-9)).astype(np.int64).T
+    block = row * (column.max() + 1) + column
     medians, expected = [], []
     for one in np.unique(block):
-        inside = residual_m[block == one]
+        inside = error_m[block == one]
         if len(inside) >= _LEAST_IN_BLOCK:
             medians.append(np.median(inside))
-            independent = max(area_m2 * len(inside) / len(residual_m) / correlated_m2, 1.0)
-            expected.append(np.pi / 2 * mad_sigma(inside) ** 2 / independent)
+            expected.append(np.pi / 2 * mad_sigma(inside) ** 2 / max(apart * len(inside), 1.0))
     if len(medians) < 4:
         return 0.0
     return float(np.sqrt(max(float(np.var(medians, ddof=1)) - float(np.mean(expected)), 0.0)))

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
+from scipy.ndimage import binary_erosion, map_coordinates, maximum_filter, minimum_filter
 
 from pipelines.change.datum import Epoch, Shared
 from pipelines.change.detection import LAGS, STEEPEST, Cells, Noise, Samples
@@ -40,6 +40,7 @@ _FINER = 1.5  # cells of the other raster in one of the grid, from which they ar
 _SEED = 20260101
 _MARGIN = 24  # cells around a window, in which an interpolated part is seen whole
 _MOST_REACH = 4  # cells, of an error in the plan
+_RIM = 2  # cells beside ground that a date has not measured, which may lie on either side of a wall that none shows
 _NOISE_RANGE = 6.0  # σ between the highest and the lowest of a neighbourhood of level cells, at most
 
 
@@ -182,10 +183,16 @@ class CommonGrid:
         return np.stack(np.meshgrid(x, y), axis=-1) * self.unit_m
 
     def heights_m(self, window: GridWindow) -> tuple[FloatArray, FloatArray]:
-        """Return the heights (H, W) of both epochs, where both have some, measured or not; NaN elsewhere."""
+        """Return the heights (H, W) of both epochs, where both have some, measured or not; NaN elsewhere.
+
+        Heights on the rim of what is known do not count: a wall that ends there cannot be seen.
+        """
+        wide, core = self.around(window, _RIM)
         frame = self.part(window)
-        heights = [self._read(one, one.names[0], frame) * one.unit_m for one in self.rasters]
+        heights = [self._read(one, one.names[0], self.part(wide)) * one.unit_m for one in self.rasters]
         known = np.isfinite(heights[0]) & np.isfinite(heights[1])
+        known = binary_erosion(known, np.ones((3, 3)), _RIM, border_value=1)[core]
+        heights = [height[core] for height in heights]
         if self._inside is not None:
             known &= cells_inside(self._inside, frame)
         return np.where(known, heights[0], np.nan), np.where(known, heights[1], np.nan)

@@ -1,8 +1,12 @@
-"""Surfaces against the tie points of their own date: where these contradict a surface, it has not changed.
+"""Surfaces against the tie points of their own date, which say by how much a surface errs, and where it is wrong.
 
 The photographs of a date know a place twice, by the tie points that the adjusted cameras intersect, and by the
 surface. Where few photographs see the ground, as at the rim of a survey, a surface may lie decimetres beside the
 points. What it then differs from the other date's is the error of one surface.
+
+On level ground a surface follows the points, with errors that vary slowly. Two dates whose photographs and ground
+are alike share much of these, and where the ground has changed they share nothing: unchanged ground does not show
+what a volume errs by, but the points of each date do.
 """
 
 from collections.abc import Sequence
@@ -13,9 +17,11 @@ import shapely
 
 from pipelines.adjust.relative import Solved
 from pipelines.change.datum import Epoch
+from pipelines.change.detection import Noise, slow_error_m, unchanged_ground
 from pipelines.change.grid import CommonGrid, EpochRasters
 from pipelines.change.tied import Surfaces, least_of_witness_m
-from pipelines.core.types import FloatArray
+from pipelines.core.progress import Progress
+from pipelines.core.types import BoolArray, FloatArray
 from pipelines.formats.geotiff import sampled_raster
 from pipelines.geodesy.crs import PointCrs
 from pipelines.geodesy.enu import lla_from_enu
@@ -25,6 +31,8 @@ _LEAST_POINTS = 2  # of a date in a region
 _HALF = 0.5  # of a change: if a surface's own error is more, the change is its error
 _AROUND_CELLS = 2.0  # of a point, where the surface has to be unbroken: a wall's points lie beneath the roof's edge
 _MARGIN_M = 2.0  # by which the adjustment may move points
+_MOST_POINTS = 20_000  # of a date, by which the errors of its surface are measured
+_IN_BLOCK = 60  # of them on average: their median is known to a sixth of what single ones scatter
 
 
 @dataclass(frozen=True)
@@ -61,7 +69,11 @@ def contradicted_by_own_points(
     if not found:
         return ()
     near = shapely.union_all([polygons[index] for index in found]).buffer(_MARGIN_M / grid.unit_m)
-    before, after = (_compared(*date, grid.crs, near) for date in zip(grid.rasters, grid.epochs, strict=True))
+    shapely.prepare(near)
+    before, after = (
+        _compared(rasters, epoch, grid.crs, shapely.contains_xy(near, _about(epoch, grid.crs)))
+        for rasters, epoch in zip(grid.rasters, grid.epochs, strict=True)
+    )
 
     def is_contradicted(index: int) -> bool:
         polygon, least_m = polygons[index], least_of_witness_m(regions[index])
@@ -70,13 +82,44 @@ def contradicted_by_own_points(
     return tuple(index for index in found if is_contradicted(index))
 
 
-def _compared(rasters: EpochRasters, epoch: Epoch, crs: PointCrs, near: shapely.Geometry) -> _Compared:
-    """Return the tie points of a date in an area against its raster of heights."""
+def noise_of(grid: CommonGrid, stable: shapely.Geometry | None, progress: Progress, *, with_tilt: bool) -> Noise:
+    """Return the errors of the difference of two epochs, by their unchanged ground and by their own tie points.
+
+    `stable` is a polygon in the CRS of the ground that counts; None: all does. Errors as of `unchanged_ground`.
+    """
+    slow_m = 0.0
+    if grid.rasters[0].of == "surface":
+        before, after = (_slow_error_m(*date, grid.crs) for date in zip(grid.rasters, grid.epochs, strict=True))
+        slow_m = float(np.hypot(before, after))
+    samples = grid.samples(stable, progress)
+    return unchanged_ground(samples, grid.cell_m, grid.datum_h_m, with_tilt=with_tilt, slow_m=slow_m)
+
+
+def _slow_error_m(rasters: EpochRasters, epoch: Epoch, crs: PointCrs) -> float:
+    """Return the σ of what a surface errs by over whole blocks of level ground, by its date's tie points."""
+    count = len(epoch.posterior.sparse.point_id)
+    chosen = np.zeros(count, dtype=bool)
+    chosen[:: -(-count // _MOST_POINTS)] = True
+    points = _compared(rasters, epoch, crs, chosen)
+    level = points.relief_m <= points.step_m
+    place_m = crs.horizontal_unit * points.plan[level]
+    if len(place_m) < _IN_BLOCK:
+        return 0.0
+    area_m2 = float(np.prod(np.ptp(place_m, axis=0)))
+    side_m = np.sqrt(area_m2 * _IN_BLOCK / len(place_m))
+    return slow_error_m(place_m, points.off_m[level], np.full(2, side_m))
+
+
+def _about(epoch: Epoch, crs: PointCrs) -> FloatArray:
+    """Return the places (K, 2) of all tie points of a date before their intersection, to centimetres."""
     solved, origin = Solved(epoch.posterior, epoch.survey.origin_on_earth), epoch.survey.origin_on_earth
-    about = crs.xyz_from_lla(lla_from_enu(solved.point_in_geo, origin))
-    shapely.prepare(near)
-    ids = epoch.posterior.sparse.point_id[shapely.contains_xy(near, about[:, 0], about[:, 1])]
-    place = crs.xyz_from_lla(lla_from_enu(solved.tracks(ids)[0], origin))
+    return np.asarray(crs.xyz_from_lla(lla_from_enu(solved.point_in_geo, origin))[:, :2])
+
+
+def _compared(rasters: EpochRasters, epoch: Epoch, crs: PointCrs, chosen: BoolArray) -> _Compared:
+    """Return the `chosen` (K,) tie points of a date against its raster of heights, where it is known."""
+    solved, origin = Solved(epoch.posterior, epoch.survey.origin_on_earth), epoch.survey.origin_on_earth
+    place = crs.xyz_from_lla(lla_from_enu(solved.tracks(epoch.posterior.sparse.point_id[chosen])[0], origin))
     step = _AROUND_CELLS * max(rasters.frame.step_x, rasters.frame.step_y)
     around = step * np.stack(np.meshgrid([0.0, -1.0, 1.0], [0.0, -1.0, 1.0]), axis=-1).reshape(-1, 1, 2)
     heights = sampled_raster(rasters.folder / rasters.names[0], (place[:, :2] + around).reshape(-1, 2))

@@ -21,7 +21,6 @@ from pipelines.change.detection import (
     Noise,
     level_of_detection,
     significant_change,
-    unchanged_ground,
 )
 from pipelines.change.grid import (
     DOUBTFUL,
@@ -33,7 +32,7 @@ from pipelines.change.grid import (
     epoch_rasters,
 )
 from pipelines.change.options import ChangeOptions
-from pipelines.change.own_points import contradicted_by_own_points
+from pipelines.change.own_points import contradicted_by_own_points, noise_of
 from pipelines.change.page import Compared, change_page
 from pipelines.change.regions import (
     DoubtfulRegions,
@@ -108,9 +107,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
     grid = CommonGrid((before, after), epochs, shared, inside, tied)
     stable = _polygons(options.stable, "--stable", after, options)
     ground = None if stable is None else shapely.union_all(stable)
-    noise = unchanged_ground(
-        grid.samples(ground, stage.progress), grid.cell_m, grid.datum_h_m, with_tilt=options.tilt
-    )
+    noise = noise_of(grid, ground, stage.progress, with_tilt=options.tilt)
     registration = _registration_of(noise, applied=registered, datum_v_m=grid.datum_v_m)
     parts = RasterParts(stage.out / "parts", grid)
     sign, median_lod_m = _write_rasters(stage, parts, noise, registered=registered)

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from pipelines.change.datum import shared_by
-from pipelines.change.detection import Volume, region_volumes, unchanged_ground
+from pipelines.change.detection import Volume, region_volumes
 from pipelines.change.grid import CommonGrid, epoch_rasters
 from pipelines.change.options import ChangeOptions
+from pipelines.change.own_points import noise_of
 from pipelines.change.regions import FoundRegions, region_of
 from pipelines.change.tied import Tied
 from pipelines.core.errors import GeorefError
@@ -105,8 +106,7 @@ class _Pairs:
         epochs = ends[0].epoch, ends[1].epoch
         shared = shared_by(epochs[0].survey, epochs[1].survey, same_base=options.same_base)
         grid = CommonGrid((before, after), epochs, shared, self.ground.area, self.tied.between(first, last))
-        samples = grid.samples(self.ground.stable, self.progress)
-        noise = unchanged_ground(samples, grid.cell_m, grid.datum_h_m, with_tilt=options.tilt)
+        noise = noise_of(grid, self.ground.stable, self.progress, with_tilt=options.tilt)
         sums = [Volume() for _ in self.found.polygons]
         for window in grid.windows():
             cells, frame = grid.registered(window, noise, applied=options.is_registered), grid.part(window)

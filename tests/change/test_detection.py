@@ -13,6 +13,7 @@ from pipelines.change.detection import (
     Samples,
     region_volumes,
     significant_change,
+    slow_error_m,
     unchanged_ground,
 )
 from pipelines.core.errors import DegenerateGeometryError
@@ -32,7 +33,7 @@ def level_cells(difference: FloatArray, variance: FloatArray, datum: FloatArray,
     return Cells(difference, variance, datum, slope, np.zeros(shape), np.ones(shape, dtype=bool))
 
 
-def analysed(difference: FloatArray, stated: float = 0.5) -> tuple[Cells, Noise]:
+def analysed(difference: FloatArray, stated: float = 0.5, slow_m: float = 0.0) -> tuple[Cells, Noise]:
     """Cells of a level raster whose variance is stated as a multiple of what it is, and their noise."""
     shape = difference.shape
     slope = np.random.default_rng(0).normal(0, 0.1, (*shape, 2))
@@ -50,7 +51,8 @@ def analysed(difference: FloatArray, stated: float = 0.5) -> tuple[Cells, Noise]
     picked = level_cells(
         difference[row, column], cells.variance_m2[row, column], np.zeros(len(row)), slope[row, column]
     )
-    return cells, unchanged_ground(Samples(picked, place, pairs, designs), CELL_M, 0.05, with_tilt=False)
+    samples = Samples(picked, place, pairs, designs)
+    return cells, unchanged_ground(samples, CELL_M, 0.05, with_tilt=False, slow_m=slow_m)
 
 
 def test_noise_of_no_change_is_found_and_gives_few_false_alarms() -> None:
@@ -94,6 +96,34 @@ def test_an_interpolated_part_errs_as_one() -> None:
 def test_a_copy_is_told_from_a_second_flight() -> None:
     with pytest.raises(DegenerateGeometryError, match="of one flight"):
         analysed(np.full((SIDE, SIDE), SHIFT_M))
+
+
+@pytest.mark.parametrize("slow_m", [0.0, 0.01, 0.03])
+def test_slow_errors_are_told_from_noise(slow_m: float) -> None:
+    """9000 points with 2.5 cm of noise, a tenth of them off by decimetres, in 150 blocks that err as wholes.
+
+    The σ of 150 normal errors is known to 6 %; the noise of a block's median of 60, 4 mm, is taken off to a third.
+    """
+    rng = np.random.default_rng(6)
+    place_m = rng.uniform(0, (150.0, 100.0), (9000, 2))
+    of_block = rng.normal(0, 1.0, (10, 15))
+    column, row = (place_m // 10.0).astype(int).T
+    error_m = slow_m * of_block[row, column] + rng.normal(0, 0.025, 9000)
+    error_m[::10] += 0.4
+    found_m = slow_error_m(place_m, error_m, np.full(2, 10.0))
+    assert found_m == pytest.approx(slow_m, rel=0.2, abs=0.0025)
+
+
+def test_a_region_has_the_slow_errors_that_unchanged_ground_hides() -> None:
+    """Both surfaces err alike where nothing has changed; a volume has the whole σ of what each is known to err."""
+    cells, noise = analysed(correlated_noise(np.random.default_rng(7)), slow_m=0.05)
+    assert noise.long_range_m == pytest.approx(0.05)
+    inside = np.zeros((SIDE, SIDE), dtype=np.int64)
+    inside[40:280, 40:280] = 1
+    level = replace(cells, datum_m=np.full((SIDE, SIDE), noise.long_range_m))
+    (volume,) = region_volumes(inside, level, 1)
+    area_m2 = (inside > 0).sum() * CELL_M**2
+    assert volume.sigma_m3(noise, CELL_M**2) == pytest.approx(0.05 * area_m2, rel=0.05)
 
 
 def test_volumes_err_as_their_sigma_says_over_twenty_pairs() -> None:

@@ -36,7 +36,8 @@ def put_on(raster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def on_surface(self: Solved, ids: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
         place, *rays = tracks(self, ids)
         xyz = crs.xyz_from_lla(lla_from_enu(place, self.origin))
-        xyz[:, 2] = sampled_raster(raster, xyz[:, :2])
+        on_raster = sampled_raster(raster, xyz[:, :2])
+        xyz[:, 2] = np.where(np.isfinite(on_raster), on_raster, xyz[:, 2])
         return (enu_from_ecef(ecef_from_lla(crs.lla_from_xyz(xyz)), self.origin), *rays)
 
     monkeypatch.setattr(Solved, "tracks", on_surface)

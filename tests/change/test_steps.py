@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 import shapely
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from pipelines.change.grid import step_variance
 from pipelines.change.options import ChangeOptions
@@ -61,6 +64,37 @@ def test_changes_are_found_between_displaced_walls(tmp_path: Path) -> None:
         sorted(change.regions, key=lambda one: one.net_m3), sorted([house_gone, house_new, pit, heap]), strict=True
     ):
         assert abs(region.net_m3 - true) < 2.5 * region.sigma_m3
+
+
+def test_a_wall_beside_unknown_ground_is_in_no_volume(tmp_path: Path) -> None:
+    """Of a house that was pulled down, the earlier date has measured no roof, and its wall a cell too far outside.
+
+    Those cells are metres lower later, which neither of them is: nothing shows the wall that they belong to.
+    """
+    pair = town_pair(tmp_path, changed=True)
+    before, after = pair.workspaces
+    house = pair.risen_m < -2.0
+    wall = binary_dilation(house) & ~house
+    with rasterio.open(before.root / "raster/dsm.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as raster:
+        heights = raster.read(1)
+        roof = heights[house].max()
+        raster.write(np.select([house, wall], [raster.nodata, roof], heights).astype(heights.dtype), 1)
+        row, column = np.nonzero(binary_dilation(house, iterations=8))
+        (west, south), (east, north) = (
+            raster.transform * (column.min(), row.max() + 1),
+            raster.transform * (column.max() + 1, row.min()),
+        )
+    polygons = tmp_path / "house.geojson"
+    ring = shapely.geometry.mapping(shapely.box(west, south, east, north))
+    polygons.write_text(json.dumps({"type": "Polygon", "coordinates": ring["coordinates"]}), "utf-8")
+    (out := tmp_path / "out").mkdir()
+    options = {"before": before.root, "stable_auto": True, "regions": polygons, "polygons_crs": "EPSG:32632"}
+    run(StageRun(after, out), ChangeOptions.model_validate(options))
+    region = load_json(Change, out / "change.json").regions[0]
+    assert region.name == "P1"
+    assert region.known_share < 0.9
+    assert wall.sum() * CELL_M**2 * 4.0 > 30.0  # what the wall's cells would say
+    assert abs(region.net_m3) < 2.5 * region.sigma_m3 < 10.0
 
 
 def test_the_viewer_draws_regions_on_the_surface(tmp_path: Path) -> None:
