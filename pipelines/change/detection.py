@@ -182,7 +182,7 @@ def unchanged_ground(
                 samples.place_m[kept],
                 residual_m,
                 np.ptp(samples.place_m[kept], axis=0) / _BLOCKS,
-                apart=min(independent / kept.sum(), 1.0),
+                apart=independent / kept.sum(),
             ),
             slow_m,
         ),

@@ -99,7 +99,7 @@ def _slow_error_m(rasters: EpochRasters, epoch: Epoch, crs: PointCrs) -> float:
     """Return the σ of what a surface errs by over whole blocks of level ground, by its date's tie points."""
     count = len(epoch.posterior.sparse.point_id)
     chosen = np.zeros(count, dtype=bool)
-    chosen[:: -(-count // _MOST_POINTS)] = True
+    chosen[:: max(-(-count // _MOST_POINTS), 1)] = True
     points = _compared(rasters, epoch, crs, chosen)
     level = points.relief_m <= points.step_m
     place_m = crs.horizontal_unit * points.plan[level]
