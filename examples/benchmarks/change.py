@@ -80,6 +80,7 @@ class PairFigures:
     doubtful: int
     regions_of_no_change: int
     volumes: tuple[VolumeError, ...]
+    unmeasured: tuple[str, ...]
     lod_m: float
     gsd_m: float
     # Of the unchanged pair: what a registration finds (east, north, up), and σ of the difference, h and v.
@@ -131,6 +132,8 @@ def main() -> None:
                 f"  {one.name} {one.kind}: {one.net_m3:.1f} ± {one.sigma_m3:.1f} m³, true {one.true_m3:.1f} m³, "
                 f"error/σ {one.normalised:+.1f}"
             )
+        if figures.unmeasured:
+            print(f"  without a volume, by the share that is known: {', '.join(figures.unmeasured)}")
     _print_all(every)
     if args.json:
         args.json.write_text(json.dumps([asdict(one) for one in every], indent=1) + "\n", "utf-8")
@@ -190,6 +193,7 @@ def measured_pair(args: argparse.Namespace, seed: int, folder: Path) -> PairFigu
         doubtful=len(change.doubtful),
         regions_of_no_change=len(same.regions),
         volumes=tuple(_volume_errors(truth, change, folder, true_from_seen, risen)),
+        unmeasured=tuple(f"{name} ({share:.0%})" for name, share in change.unmeasured.items()),
         lod_m=change.median_lod_m,
         gsd_m=_ground_sampling_m(Workspace(folder / "first")) or float("nan"),
         stable_shift_m=same.registration.shift_m,

@@ -308,6 +308,11 @@ class Volume:
             missing=self.missing + other.missing,
         )
 
+    @property
+    def known_share(self) -> float:
+        """Share of the cells that have a height of both dates."""
+        return self.cells / max(self.cells + self.missing, 1)
+
     def sigma_m3(self, noise: Noise, cell_m2: float, *, to_detect: bool = False) -> float:
         """Return the σ of the net volume: the datum's in full, and of the cells by their number that counts.
 

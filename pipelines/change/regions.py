@@ -8,8 +8,9 @@ errors, and that of the whole exceeds 1.96 σ.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from pipelines.survey.change_report import ChangedRegion, DoubtfulRegion
 CELLS = ("difference", "datum", "variance", "step")  # parts that volumes are made of
 _LEAST_REACH, _MOST_REACH = 2, 10  # cells
 _CHANCE = 0.05  # that noise alone makes a region anywhere
+_LEAST_KNOWN = 0.25  # of a given polygon: what is known of less lies along walls that no date shows whole
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ class FoundRegions:
     """Regions with their polygons in the CRS, those of the user first, and the sign (H, W) of cells in cores.
 
     `lowered`, `raised` and `every` are the sums of those that were found. `number` (H, W) is the place in
-    `regions`, counted from 1, of the region in whose core a cell lies; 0: in none.
+    `regions`, counted from 1, of the region in whose core a cell lies; 0: in none. `unmeasured` has the
+    known share by the name of given polygons that are no regions, as hardly any of them is known.
     """
 
     regions: tuple[ChangedRegion, ...]
@@ -71,6 +74,7 @@ class FoundRegions:
     sign: NDArray[np.int8]
     number: NDArray[np.int32]
     volumes: tuple[Volume, ...]
+    unmeasured: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -144,11 +148,14 @@ def find_regions(
         for rank, polygon in enumerate(given):
             of_polygon = cells_inside(polygon, grid.part(window)).astype(np.int64)
             of_given[rank] += region_volumes(of_polygon, cells, 1)[0]
-    for rank, polygon in enumerate(given):
-        cells_in_all = round(polygon.area / (grid.frame.step_x * grid.frame.step_y))
-        missing = max(cells_in_all - of_given[rank].cells, 0)
-        of_given[rank] = replace(of_given[rank], missing=missing)
-    polygons = list(given)
+    of_given = [
+        replace(one, missing=max(round(polygon.area / grid.frame.step_x / grid.frame.step_y) - one.cells, 0))
+        for one, polygon in zip(of_given, given, strict=True)
+    ]
+    share = {f"P{rank}": one.known_share for rank, one in enumerate(of_given, start=1)}
+    names = [name for name, known in share.items() if known >= _LEAST_KNOWN]
+    is_region = [name in names for name in share]
+    polygons = list(compress(given, is_region))
     net, sigma, net_of_core, sigma_of_core = (
         np.array(values)
         for sums in (whole, cores)
@@ -165,18 +172,18 @@ def find_regions(
     for index in kept.tolist():
         polygons.append(_outline(number, index + 1, places[index], grid))
     of_place = np.zeros(count + 1, dtype=np.int32)
-    of_place[kept + 1] = len(given) + 1 + np.arange(len(kept))
+    of_place[kept + 1] = len(names) + 1 + np.arange(len(kept))
     in_cores = np.where(sign != 0, of_place[number], 0).astype(np.int32)
-    every = (*of_given, *(whole[index] for index in kept.tolist()))
-    return _named(
-        every,
+    found = _named(
+        (*compress(of_given, is_region), *(whole[index] for index in kept.tolist())),
         polygons,
-        given=len(given),
+        given=names,
         sign=np.where(in_cores > 0, sign, 0),
         number=in_cores,
         noise=noise,
         cell_m2=grid.cell_m2,
     )
+    return replace(found, unmeasured={name: known for name, known in share.items() if name not in names})
 
 
 def without_doubtful(
@@ -191,7 +198,7 @@ def without_doubtful(
     remaining = _named(
         tuple(found.volumes[index] for index in kept),
         [found.polygons[index] for index in kept],
-        given=sum(found.regions[index].name.startswith("P") for index in kept),
+        given=[found.regions[index].name for index in kept if found.regions[index].name.startswith("P")],
         sign=np.where(number > 0, found.sign, 0),
         number=number,
         noise=noise,
@@ -201,22 +208,23 @@ def without_doubtful(
         DoubtfulRegion(**found.regions[index].model_dump() | {"name": f"D{rank}"}, reason=doubtful[index])
         for rank, index in enumerate(out, start=1)
     )
-    return remaining, DoubtfulRegions(regions, [found.polygons[index] for index in out], inside)
+    polygons = [found.polygons[index] for index in out]
+    return replace(remaining, unmeasured=found.unmeasured), DoubtfulRegions(regions, polygons, inside)
 
 
 def _named(
     every: tuple[Volume, ...],
     polygons: list[shapely.Geometry],
     *,
-    given: int,
+    given: Sequence[str],
     sign: IntArray | NDArray[np.int8],
     number: NDArray[np.int32],
     noise: Noise,
     cell_m2: float,
 ) -> FoundRegions:
     """Return regions by their volumes, of which the first are those of `given` polygons, with the others' sums."""
-    of_found = every[given:]
-    names = [*(f"P{index + 1}" for index in range(given)), *(f"R{index + 1}" for index in range(len(of_found)))]
+    of_found = every[len(given) :]
+    names = [*given, *(f"R{index + 1}" for index in range(len(of_found)))]
     sums = {
         "lowered": [one for one in of_found if one.fill < one.cut],
         "raised": [one for one in of_found if one.fill > one.cut],
@@ -224,7 +232,7 @@ def _named(
     }
     lowered, raised, total = (region_of(name, sum(parts, Volume()), noise, cell_m2) for name, parts in sums.items())
     regions = tuple(region_of(name, one, noise, cell_m2) for name, one in zip(names, every, strict=True))
-    return FoundRegions(regions, lowered, raised, total, polygons, sign.astype(np.int8), number, every)
+    return FoundRegions(regions, lowered, raised, total, polygons, sign.astype(np.int8), number, every, {})
 
 
 def _outline(number: IntArray | NDArray[np.int32], which: int, box: tuple[slice, slice], grid: CommonGrid) -> Any:
@@ -245,5 +253,5 @@ def region_of(name: str, volume: Volume, noise: Noise, cell_m2: float) -> Change
         sigma_m3=volume.sigma_m3(noise, cell_m2),
         lowest_m=volume.lowest,
         highest_m=volume.highest,
-        known_share=volume.cells / max(volume.cells + volume.missing, 1),
+        known_share=volume.known_share,
     )

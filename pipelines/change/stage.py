@@ -137,6 +137,7 @@ def run(stage: StageRun, options: ChangeOptions) -> Summary:
         found=found.every,
         regions=found.regions,
         doubtful=doubtful.regions,
+        unmeasured=dict(found.unmeasured),
         along_normals=moved,
         common=None if tied is None else tied.common,
         by_date=by_date,
@@ -370,7 +371,14 @@ def _doubted(found: FoundRegions, doubtful: DoubtfulRegions, partly: list[str]) 
 
 
 def _partly_known(found: FoundRegions) -> Iterator[Remark]:
-    """Yield the warning of given regions of which much has no height of one of the dates."""
+    """Yield the warnings of given regions of which much, or nearly all, has no height of one of the dates."""
+    none = [f"{name} ({share:.0%})" for name, share in found.unmeasured.items()]
+    if none:
+        sentence = (
+            f"{listed(none)} {'has' if len(none) == 1 else 'have'} no volume: hardly any of the polygon has a "
+            "height of both dates, and that part lies along walls that one of them does not show whole."
+        )
+        yield Remark(code="region-not-measured", sentence=sentence)
     few = [f"{one.name} ({one.known_share:.0%})" for one in found.regions if one.known_share < _MOSTLY_KNOWN]
     if few:
         sentence = (

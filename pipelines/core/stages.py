@@ -521,7 +521,7 @@ CHANGE = StageSpec(
         "change/regions.csv",
         CHANGE_PAGE,
     ),
-    product_version=5,  # σ by the tie points of both dates, and without the rim of what is known
+    product_version=6,  # no volume of a polygon that is hardly known
 )
 
 # No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pydantic import Field
+
 from pipelines.core.products import Product
 from pipelines.core.types import Vector3
 
@@ -129,6 +131,7 @@ class Change(Product):
         doubtful: the largest first.
         along_normals: of the clouds, on request.
         common: what ties both epochs; None: they were solved apart.
+        unmeasured: known share of the user's polygons that are no regions, as hardly any of them is known, by name.
         by_date: volumes in the regions at each later date of a chain, in their order; empty without dates between.
     """
 
@@ -147,6 +150,7 @@ class Change(Product):
     found: ChangedRegion
     regions: tuple[ChangedRegion, ...]
     doubtful: tuple[DoubtfulRegion, ...] = ()
+    unmeasured: dict[str, float] = Field(default_factory=dict)
     along_normals: AlongNormals | None = None
     common: CommonDates | None = None
     by_date: tuple[DateOfChange, ...] = ()

@@ -69,7 +69,8 @@ def test_changes_are_found_between_displaced_walls(tmp_path: Path) -> None:
 def test_a_wall_beside_unknown_ground_is_in_no_volume(tmp_path: Path) -> None:
     """Of a house that was pulled down, the earlier date has measured no roof, and its wall a cell too far outside.
 
-    Those cells are metres lower later, which neither of them is: nothing shows the wall that they belong to.
+    Those cells are metres lower later, which neither of them is: nothing shows the wall that they belong to. A
+    polygon of the roof alone has no volume, and the others keep their names.
     """
     pair = town_pair(tmp_path, changed=True)
     before, after = pair.workspaces
@@ -85,14 +86,19 @@ def test_a_wall_beside_unknown_ground_is_in_no_volume(tmp_path: Path) -> None:
             raster.transform * (column.max() + 1, row.min()),
         )
     polygons = tmp_path / "house.geojson"
-    ring = shapely.geometry.mapping(shapely.box(west, south, east, north))
-    polygons.write_text(json.dumps({"type": "Polygon", "coordinates": ring["coordinates"]}), "utf-8")
+    wide = shapely.box(west, south, east, north)
+    roof_alone = wide.buffer(-8 * CELL_M, join_style="mitre")
+    rings = [shapely.geometry.mapping(one)["coordinates"] for one in (roof_alone, wide)]
+    polygons.write_text(json.dumps({"type": "MultiPolygon", "coordinates": rings}), "utf-8")
     (out := tmp_path / "out").mkdir()
     options = {"before": before.root, "stable_auto": True, "regions": polygons, "polygons_crs": "EPSG:32632"}
-    run(StageRun(after, out), ChangeOptions.model_validate(options))
-    region = load_json(Change, out / "change.json").regions[0]
-    assert region.name == "P1"
-    assert region.known_share < 0.9
+    summary = run(StageRun(after, out), ChangeOptions.model_validate(options))
+    change = load_json(Change, out / "change.json")
+    assert change.unmeasured == {"P1": 0.0}
+    assert "region-not-measured" in {warning.code for warning in summary.warnings}
+    region = change.regions[0]
+    assert region.name == "P2"
+    assert 0.25 < region.known_share < 0.9
     assert wall.sum() * CELL_M**2 * 4.0 > 30.0  # what the wall's cells would say
     assert abs(region.net_m3) < 2.5 * region.sigma_m3 < 10.0
 
