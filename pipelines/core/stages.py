@@ -341,7 +341,7 @@ DELIVERABLES: tuple[StageSpec, ...] = (
         delivers="folder",
         resumable=True,
         also=("raster/dsm.tif", "raster/measured.tif", "raster/sigma_h.tif", "raster/sigma_v.tif"),
-        product_version=2,  # whole inside the area of interest
+        product_version=3,  # level ground by whole Gaussians
     ),
     StageSpec(
         name="export-cloud",

@@ -230,6 +230,9 @@ _AVERAGED = 5  # checked cells on a side over which the surface's own noise is a
 # less of both, where these hide what lies below: on a simulated flight, roofs are 1.4 training pixels too wide
 # otherwise, and 0.7 with them.
 _SHRINK, _EDGE_DILATION_PX2 = 0.7, 0.05
+# Through the gaps between those, deeper ones count, and level ground lies a fifth of a training pixel too low.
+# Heights are those of whole Gaussians where both differ by less than this, in training pixels: no edge is near.
+_NO_EDGE_GSD = 1.0
 _MOST_THROUGH = 0.5  # largest number of views that look through a surface, as a part of those that agree
 # Checked cells: half the width of slivers that are dropped, and of gaps that are closed.
 _OPENED, _CLOSED = 2, 3
@@ -352,7 +355,7 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
     """Return the cells of a window, whose first cell in the raster is at `column` and `row`.
 
     1. Heights are the depths at which the view from above is half opaque, or their mean if the Gaussians of a cell
-       lie on one surface. Shrunken Gaussians count first, so that roofs end at their edges.
+       lie on one surface. Near edges shrunken Gaussians count first, so that roofs end where they do.
     2. A cell counts if enough training views show the surface there, and more than look through it. Nothing else
        tells the seen ground from what training left where nobody looked.
     3. σ is that of the georeference and of the surface. The surface's own is the RMS difference of the training
@@ -372,8 +375,9 @@ def render_window(source: RasterSource, frame: RasterFrame, column: int, row: in
         shrink=_SHRINK,
     )
     middle = inner // 2
-    broad_height, height = (_heights(source, each)[middle::inner, middle::inner] for each in (view, sharp))
-    height = np.where(np.isnan(height), broad_height, height)
+    whole, height = (_heights(source, each)[middle::inner, middle::inner] for each in (view, sharp))
+    no_edge = np.abs(height - whole) < _NO_EDGE_GSD * source.training_gsd_m / source.target.crs.height_unit_m
+    height = np.where(no_edge | np.isnan(height), whole, height)
     colour, alpha = _reduced(view.colour, inner), _reduced(view.alpha, inner)
     seen, noise_up_m, noise_h_m = _support(source, frame, height)
     modelled, height = np.where(seen, np.nan, height), np.where(seen, height, np.nan)

@@ -32,7 +32,7 @@ from pipelines.geometry.cameras import Camera, Pinhole
 from pipelines.geometry.rotations import exp_so3, matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from pipelines.geometry.similarity import Similarity
 from pipelines.splat.gaussians import Gaussians, transformed, write_gaussians
-from pipelines.splat.rasterizer.api import RasterSettings
+from pipelines.splat.rasterizer.api import RasterSettings, Render
 from pipelines.splat.rasterizer.cpu import CpuRasterizer
 from pipelines.splat.sh import sh_from_rgb
 from pipelines.surface.measured_area import area_of
@@ -60,14 +60,14 @@ GSD = 0.15  # about a pixel of the cameras
 UTM = "EPSG:32632"
 
 
-def surface_gaussians() -> Gaussians:
-    """Return flat, opaque Gaussians in `geo` on ground, roof and walls."""
+def surface_gaussians(scatter_m: float = 0.002) -> Gaussians:
+    """Return flat, opaque Gaussians in `geo` on ground, roof and walls; `scatter_m` is the σ of their heights."""
     step, sigma = SQUARE_M / 27, 0.08  # borders of squares lie in the middle between Gaussians
     grid = np.arange(-4 * SQUARE_M + step / 2, 4 * SQUARE_M, step)
     east, north = (axis.ravel() for axis in np.meshgrid(grid, grid))
     on_roof = (np.abs(east) < TOWER_M) & (np.abs(north) < TOWER_M)
     # Blending goes by height. On perfectly level ground the Earth's curvature would decide which of two lies above.
-    rough = np.random.default_rng(2).normal(0, 0.002, east.shape)
+    rough = np.random.default_rng(2).normal(0, scatter_m, east.shape)
     level = np.column_stack([east, north, np.where(on_roof, TOWER_HEIGHT_M, 0.0) + rough])
     dark = (np.floor(east / SQUARE_M) + np.floor(north / SQUARE_M)) % 2 == 0
     colour = np.where(on_roof[:, None], [0.8, 0.2, 0.1], np.where(dark[:, None], 0.15, 0.85))
@@ -92,12 +92,10 @@ def surface_gaussians() -> Gaussians:
     )
 
 
-def write_trained(root: Path) -> Workspace:
-    """Return a workspace with the model, as `train` would leave it."""
-    rng = np.random.default_rng(0)
+def flown_scene(rng: np.random.Generator) -> TrueScene:
     center = np.array([[e, n, 30.0] for e in (-9, -3, 3, 9) for n in (-9, -3, 3, 9)], dtype=float)
     points = np.column_stack([rng.uniform(-15, 15, (500, 2)), np.zeros(500)])
-    scene = TrueScene(
+    return TrueScene(
         center,
         looking_at(center, center * [0.7, 0.7, 0] + [0.0, 1e-3, 0.0]),
         points,
@@ -105,6 +103,12 @@ def write_trained(root: Path) -> Workspace:
         camera=CAMERA,
         geo_from_local=GEO_FROM_MODEL,
     )
+
+
+def write_trained(root: Path, scatter_m: float = 0.002) -> Workspace:
+    """Return a workspace with the model, as `train` would leave it."""
+    rng = np.random.default_rng(0)
+    scene, gaussians = flown_scene(rng), surface_gaussians(scatter_m)
     noise = Noise(pixel_px=0.2)
     survey, sparse = survey_of(scene, noise, Measured(), rng), sparse_model(scene, noise, rng)
     workspace = write_workspace(root, survey, sparse)
@@ -121,22 +125,27 @@ def write_trained(root: Path) -> Workspace:
     )
     save_npz(root / POINTS, vars(geolocate(survey, sparse, GeolocateOptions()).points))
     save_json(trained_model(GEO_FROM_MODEL, max_image_size=192, cameras=cameras), root / MODEL)
-    write_gaussians(root / GAUSSIANS, transformed(surface_gaussians(), GEO_FROM_MODEL.inverse()))
+    write_gaussians(root / GAUSSIANS, transformed(gaussians, GEO_FROM_MODEL.inverse()))
     write_adjustment(workspace)
-    _write_photographs(root, scene)
+    _write_photographs(root, scene, gaussians)
     return workspace
 
 
-def _write_photographs(folder: Path, scene: TrueScene) -> None:
+def seen_by(scene: TrueScene, camera: int, gaussians: Gaussians) -> Render:
+    pose, rotation = np.eye(4), scene.geo_from_cam[camera]
+    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ scene.center_in_geo[camera]
+    pinhole, settings = (
+        Pinhole(CAMERA.width, CAMERA.height, *CAMERA.params),
+        RasterSettings(sh_degree=0, depth=True),
+    )
+    with torch.no_grad():
+        return CpuRasterizer().render(gaussians, torch.from_numpy(pose).float(), pinhole, settings)
+
+
+def _write_photographs(folder: Path, scene: TrueScene, gaussians: Gaussians) -> None:
     """Render every view: cells that the photographs do not confirm do not count."""
-    pinhole, surface = Pinhole(CAMERA.width, CAMERA.height, *CAMERA.params), surface_gaussians()
-    for name, center, rotation in zip(scene.names, scene.center_in_geo, scene.geo_from_cam, strict=True):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ center
-        with torch.no_grad():
-            view = CpuRasterizer().render(
-                surface, torch.from_numpy(pose).float(), pinhole, RasterSettings(sh_degree=0)
-            )
+    for camera, name in enumerate(scene.names):
+        view = seen_by(scene, camera, gaussians)
         rgb = (255 * view.colour.clamp(0, 1)).round().byte().numpy()
         # The names end in .jpg, whose losses would be noise: the content is PNG, which OpenCV goes by.
         (folder / name).write_bytes(cv2.imencode(".png", rgb[..., ::-1])[1].tobytes())
@@ -175,6 +184,31 @@ def test_heights_are_those_of_ground_and_roof(workspace: Workspace) -> None:
         xyz = in_utm(points, workspace)
         off = at(workspace.path("raster/dsm.tif"), xyz) - xyz[:, 2]
         assert np.sqrt(np.mean(off**2)) < 0.1 * GSD
+
+
+def test_level_ground_lies_where_the_cameras_see_it(tmp_path: Path) -> None:
+    """Gaussians of a training scatter about the surface, and the upper ones hide the lower: the surface is what the
+    cameras see of them. Shrunken ones alone would be 0.2 cells lower.
+    """
+    scatter_m = 0.05
+    scattered = write_trained(tmp_path / "ws", scatter_m)
+    run_stage(scattered, BY_NAME["export-raster"], {"crs": UTM, "gsd": GSD, "colours": "splat", "fill": "all"})
+    scene, off = flown_scene(np.random.default_rng(0)), []
+    gaussians = surface_gaussians(scatter_m)
+    fx, fy, cx, cy = CAMERA.params[:4]
+    for camera in range(len(scene.names)):
+        depth = seen_by(scene, camera, gaussians).expected_depth
+        assert depth is not None
+        row, column = np.mgrid[20 : CAMERA.height - 20 : 8, 20 : CAMERA.width - 20 : 8].reshape(2, -1)
+        ray = np.column_stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones(len(row))])
+        place = (
+            scene.center_in_geo[camera] + (ray * depth.numpy()[row, column, None]) @ scene.geo_from_cam[camera].T
+        )
+        place = place[(np.abs(place[:, :2]).max(axis=1) < 9) & (np.abs(place[:, :2]).max(axis=1) > TOWER_M + 1)]
+        xyz = in_utm(place, scattered)
+        off += (at(scattered.path("raster/dsm.tif"), xyz) - xyz[:, 2])[place[:, 2] < 1].tolist()
+    assert len(off) > 1000
+    assert abs(np.nanmedian(off)) < 0.05 * GSD
 
 
 def test_roof_ends_at_its_edges(workspace: Workspace) -> None:
