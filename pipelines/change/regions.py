@@ -3,7 +3,8 @@
 A region is found by its core, the cells that change significantly. Its volume includes a rim, in which a change
 fades below the level of detection, and the uncertain cells of walls and of interpolated parts. It is real if the
 net volume of its core exceeds its σ by more than chance gives among as many places as the scene has independent
-errors, and that of the whole exceeds 1.96 σ.
+errors, and that of the whole exceeds 1.96 σ. Beside unmeasured ground surfaces err by more than their σ says, over
+the area in which errors are one: cells so near to it do not tell whether a region is real.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, find_objects, label
+from scipy.ndimage import binary_dilation, distance_transform_edt, find_objects, label
 from scipy.special import erfc
 
 from pipelines.change.detection import QUANTILE_95, Cells, Noise, Volume, region_volumes
@@ -91,6 +92,11 @@ def reach_of(grid: CommonGrid, noise: Noise) -> int:
     return int(np.clip(round(noise.length_m / grid.cell_m), _LEAST_REACH, _MOST_REACH))
 
 
+def rim_of(grid: CommonGrid, noise: Noise) -> float:
+    """Return the distance in cells from unmeasured ground up to which the errors are those of its rim."""
+    return float(np.sqrt(noise.correlated_m2 / np.pi) / grid.cell_m)
+
+
 def candidates(
     sign: NDArray[np.int8], measured: BoolArray, cell_m2: float, reach: int, min_area_m2: float
 ) -> NDArray[np.int32]:
@@ -136,10 +142,11 @@ def find_regions(
     number = candidates(sign, measured, grid.cell_m2, reach_of(grid, noise), min_area_m2)
     count = int(number.max(initial=0))
     whole, cores, of_given = ([Volume() for _ in range(size)] for size in (count, count, len(given)))
+    telling = (sign != 0) & (distance_transform_edt(np.pad(measured, 1))[1:-1, 1:-1] > rim_of(grid, noise))
     for window in grid.windows():
         cells = parts.cells(window)
         inside = number[window.slices]
-        core = np.where(sign[window.slices] != 0, inside, 0)
+        core = np.where(telling[window.slices], inside, 0)
         of_window = region_volumes(inside, cells, count), region_volumes(core, cells, count)
         whole, cores = (
             [one + two for one, two in zip(sums, more, strict=True)]

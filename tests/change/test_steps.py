@@ -103,6 +103,38 @@ def test_a_wall_beside_unknown_ground_is_in_no_volume(tmp_path: Path) -> None:
     assert abs(region.net_m3) < 2.5 * region.sigma_m3 < 10.0
 
 
+def test_the_rim_of_what_is_measured_tells_no_change(tmp_path: Path) -> None:
+    """Around a hole the later surface errs by 0.6 m, as surfaces do where few photographs see the ground.
+
+    So far from the hole as errors are one there is nothing more to see. A heap of that height is found elsewhere.
+    """
+    pair = town_pair(tmp_path, changed=False)
+    before, after = pair.workspaces
+    level = [
+        (row, column)
+        for row in range(20, pair.after.shape[0] - 20, 5)
+        for column in range(20, pair.after.shape[1] - 20, 5)
+        if np.ptp(pair.after[row - 20 : row + 20, column - 20 : column + 20]) < 0.5
+    ]
+    places = np.array(level)
+    (first_row, first_column), (row, column) = (
+        level[0],
+        level[int(np.argmax(np.linalg.norm(places - places[0], axis=1)))],
+    )
+    hole, heap = (np.zeros(pair.after.shape, dtype=bool) for _ in range(2))
+    hole[first_row - 8 : first_row + 8, first_column - 8 : first_column + 8] = True
+    heap[row - 8 : row + 8, column - 8 : column + 8] = True
+    with rasterio.open(after.root / "raster/dsm.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as raster:
+        heights = raster.read(1)
+        heights[heap | binary_dilation(hole, iterations=6)] += 0.6
+        raster.write(np.where(hole, raster.nodata, heights).astype(heights.dtype), 1)
+    (out := tmp_path / "out").mkdir()
+    run(StageRun(after, out), ChangeOptions(before=before.root, stable_auto=True))
+    found = load_json(Change, out / "change.json").regions
+    assert [region.name for region in found] == ["R1"]
+    assert found[0].net_m3 == pytest.approx(0.6 * heap.sum() * CELL_M**2, rel=0.1)
+
+
 def test_the_viewer_draws_regions_on_the_surface(tmp_path: Path) -> None:
     pair = town_pair(tmp_path, changed=True)
     before, after = pair.workspaces
