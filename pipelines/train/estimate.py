@@ -16,7 +16,7 @@ from pipelines.splat.rasterizer.backends import chosen_backend
 from pipelines.surface.depth_maps import FINE
 from pipelines.survey.block_plan import BlockPlan
 from pipelines.survey.options import NOT_IN_BLOCKS
-from pipelines.train.options import PRESETS, TrainOptions, surveys_of
+from pipelines.train.options import MOST_LOOKS, PRESETS, TrainOptions, surveys_of
 from pipelines.train.schedule import COARSE, pyramid
 from pipelines.train.target_images import Crops
 
@@ -36,12 +36,14 @@ def with_effort(options: TrainOptions, photographs: int, largest: Pinhole, free_
 
     1. Up to a hundred photographs of the preset's size have the preset's effort.
     2. More photographs have more of both, in proportion: each is seen as often, and shows a place of its own.
+       Few have fewer iterations, as none is seen more than 30 times.
     3. Larger ones have more Gaussians, in proportion to their pixels, as far as all photographs together have 40
        pixels for each, and as far as they fit into `free_bytes` of memory; None: unknown.
     """
     preset, more = PRESETS[options.preset], surveys_of(photographs)
-    if options.iterations is None and more > 1:
-        options = options.model_copy(update={"iterations": round(more * preset.iterations)})
+    iterations = min(round(more * preset.iterations), MOST_LOOKS * photographs)
+    if options.iterations is None and iterations != preset.iterations:
+        options = options.model_copy(update={"iterations": iterations})
     enlarged = more**0.5 * max(max(largest.width, largest.height) / preset.max_image_size, 1.0)
     if options.max_gaussians is not None or enlarged <= 1:
         return options

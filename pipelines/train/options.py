@@ -35,6 +35,9 @@ PRESETS = {
 }
 # Iterations and Gaussians grow with the photographs beyond this number: a place is seen as often, on a larger area.
 PRESET_PHOTOGRAPHS = 100
+# Iterations for each photograph at most: in wind, more of them fit the moment of each photograph, and other
+# views get worse (examples/benchmarks/results/training.md, Presets at one size of picture).
+MOST_LOOKS = 30
 
 
 def surveys_of(photographs: int) -> float:
@@ -207,7 +210,7 @@ class GaussianOptions(StageOptions):
     preset: Literal["smoke", "fast", "standard", "high"] = Field(
         "standard",
         description=f"Effort. {_EFFORTS} (for 48 photographs on 2 cores). Beyond {PRESET_PHOTOGRAPHS} photographs "
-        "iterations and Gaussians grow in proportion.",
+        f"iterations and Gaussians grow in proportion; no photograph has more than {MOST_LOOKS} iterations.",
     )
     iterations: int | None = Field(None, ge=1, description="Iterations (default: by preset and photographs).")
     max_image_size: int | None = Field(

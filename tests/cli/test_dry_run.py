@@ -37,7 +37,7 @@ def test_before_the_first_run(georef: Georef, tmp_path: Path) -> None:
     assert {row["action"] for row in document["stages"]} == {"run"}
     assert (document["photographs"]["count"], document["photographs"]["size_px"]) == (5, [64, 48])
     training = document["training"]
-    assert (training["iterations"], training["max_gaussians"], training["training_px"]) == (200, 20_000, [64, 48])
+    assert (training["iterations"], training["max_gaussians"], training["training_px"]) == (150, 20_000, [64, 48])
     assert training["peak_bytes"] > 100e6
     seconds = {row["stage"]: row["seconds"] for row in document["stages"]}
     assert all(value > 0 for value in seconds.values())
@@ -47,7 +47,7 @@ def test_before_the_first_run(georef: Georef, tmp_path: Path) -> None:
     origins = {row["flag"]: row["origin"] for row in document["stages"][5]["options"]}
     assert origins["--preset"] == "command line" and origins["--iterations"] == "preset"
     text = georef(*words).out
-    assert "smoke: 200 iterations, 40 a photograph, at most 20000 Gaussians" in text
+    assert "smoke: 150 iterations, 30 a photograph, at most 20000 Gaussians" in text
     assert "5 of 64×48 px" in text and "Nothing was run" in text and "In all: about" in text
 
 
@@ -86,7 +86,7 @@ def test_a_run_begins_with_the_estimate(georef: Georef, tmp_path: Path) -> None:
     """Ahead of the first stage, and once."""
     write_flight(tmp_path / "photos", 5, lat=46.0, lon=7.7)
     lines = georef("run", tmp_path / "ws", "--images", tmp_path / "photos", "--max-image-size", 40).err.splitlines()
-    assert lines[0] == "train: standard: 1500 iterations, 300 a photograph, at most 150000 Gaussians"
+    assert lines[0] == "train: standard: 150 iterations, 30 a photograph, at most 150000 Gaussians"
     assert (
         lines[1] == "train: 5 photographs of 64×48 px are trained at 40×30, 1/1.6 of their side (--max-image-size)"
     )

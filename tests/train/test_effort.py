@@ -9,7 +9,7 @@ import pytest
 from pipelines.geometry.cameras import Pinhole
 from pipelines.splat.memory import USABLE, predicted_peak_bytes
 from pipelines.train.estimate import training_size, with_effort
-from pipelines.train.options import PRESETS, TrainOptions
+from pipelines.train.options import MOST_LOOKS, PRESETS, TrainOptions
 
 STANDARD = PRESETS["standard"]
 SIDE_PX = 4 * STANDARD.max_image_size
@@ -57,3 +57,10 @@ def test_more_than_a_hundred_photographs_have_as_many_looks_each() -> None:
     effort = with_effort(TrainOptions(), 1000, small, FREE).effort
     assert (effort.iterations, effort.max_gaussians) == (10 * preset.iterations, 10 * preset.max_gaussians)
     assert with_effort(TrainOptions(iterations=70, max_gaussians=900), 1000, small, FREE).effort.iterations == 70
+
+
+def test_few_photographs_are_not_looked_at_again_and_again() -> None:
+    small = LARGE.limited(STANDARD.max_image_size)
+    effort = with_effort(TrainOptions(), 18, small, FREE).effort
+    assert (effort.iterations, effort.max_gaussians) == (18 * MOST_LOOKS, STANDARD.max_gaussians)
+    assert with_effort(TrainOptions(iterations=2000), 18, small, FREE).effort.iterations == 2000
