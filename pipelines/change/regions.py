@@ -92,7 +92,7 @@ def reach_of(grid: CommonGrid, noise: Noise) -> int:
     return int(np.clip(round(noise.length_m / grid.cell_m), _LEAST_REACH, _MOST_REACH))
 
 
-def rim_of(grid: CommonGrid, noise: Noise) -> float:
+def _rim_of(grid: CommonGrid, noise: Noise) -> float:
     """Return the distance in cells from unmeasured ground up to which the errors are those of its rim."""
     return float(np.sqrt(noise.correlated_m2 / np.pi) / grid.cell_m)
 
@@ -142,7 +142,7 @@ def find_regions(
     number = candidates(sign, measured, grid.cell_m2, reach_of(grid, noise), min_area_m2)
     count = int(number.max(initial=0))
     whole, cores, of_given = ([Volume() for _ in range(size)] for size in (count, count, len(given)))
-    telling = (sign != 0) & (distance_transform_edt(np.pad(measured, 1))[1:-1, 1:-1] > rim_of(grid, noise))
+    telling = (sign != 0) & (distance_transform_edt(np.pad(measured, 1))[1:-1, 1:-1] > _rim_of(grid, noise))
     for window in grid.windows():
         cells = parts.cells(window)
         inside = number[window.slices]
@@ -160,9 +160,8 @@ def find_regions(
         for one, polygon in zip(of_given, given, strict=True)
     ]
     share = {f"P{rank}": one.known_share for rank, one in enumerate(of_given, start=1)}
-    names = [name for name, known in share.items() if known >= _LEAST_KNOWN]
-    is_region = [name in names for name in share]
-    polygons = list(compress(given, is_region))
+    is_region = [known >= _LEAST_KNOWN for known in share.values()]
+    names, polygons = list(compress(share, is_region)), list(compress(given, is_region))
     net, sigma, net_of_core, sigma_of_core = (
         np.array(values)
         for sums in (whole, cores)
@@ -181,7 +180,7 @@ def find_regions(
     of_place = np.zeros(count + 1, dtype=np.int32)
     of_place[kept + 1] = len(names) + 1 + np.arange(len(kept))
     in_cores = np.where(sign != 0, of_place[number], 0).astype(np.int32)
-    found = _named(
+    return _named(
         (*compress(of_given, is_region), *(whole[index] for index in kept.tolist())),
         polygons,
         given=names,
@@ -189,8 +188,8 @@ def find_regions(
         number=in_cores,
         noise=noise,
         cell_m2=grid.cell_m2,
+        unmeasured={name: known for name, known in share.items() if known < _LEAST_KNOWN},
     )
-    return replace(found, unmeasured={name: known for name, known in share.items() if name not in names})
 
 
 def without_doubtful(
@@ -210,13 +209,13 @@ def without_doubtful(
         number=number,
         noise=noise,
         cell_m2=cell_m2,
+        unmeasured=found.unmeasured,
     )
     regions = tuple(
         DoubtfulRegion(**found.regions[index].model_dump() | {"name": f"D{rank}"}, reason=doubtful[index])
         for rank, index in enumerate(out, start=1)
     )
-    polygons = [found.polygons[index] for index in out]
-    return replace(remaining, unmeasured=found.unmeasured), DoubtfulRegions(regions, polygons, inside)
+    return remaining, DoubtfulRegions(regions, [found.polygons[index] for index in out], inside)
 
 
 def _named(
@@ -228,6 +227,7 @@ def _named(
     number: NDArray[np.int32],
     noise: Noise,
     cell_m2: float,
+    unmeasured: Mapping[str, float],
 ) -> FoundRegions:
     """Return regions by their volumes, of which the first are those of `given` polygons, with the others' sums."""
     of_found = every[len(given) :]
@@ -239,7 +239,7 @@ def _named(
     }
     lowered, raised, total = (region_of(name, sum(parts, Volume()), noise, cell_m2) for name, parts in sums.items())
     regions = tuple(region_of(name, one, noise, cell_m2) for name, one in zip(names, every, strict=True))
-    return FoundRegions(regions, lowered, raised, total, polygons, sign.astype(np.int8), number, every, {})
+    return FoundRegions(regions, lowered, raised, total, polygons, sign.astype(np.int8), number, every, unmeasured)
 
 
 def _outline(number: IntArray | NDArray[np.int32], which: int, box: tuple[slice, slice], grid: CommonGrid) -> Any:

@@ -521,7 +521,7 @@ CHANGE = StageSpec(
         "change/regions.csv",
         CHANGE_PAGE,
     ),
-    product_version=6,  # no volume of a polygon that is hardly known
+    product_version=6,  # no region at the rim alone, no volume of a polygon that is hardly known
 )
 
 # No part of the pipeline: `georef compare` runs this stage for the baseline, whose later stages read its folder in
