@@ -74,6 +74,7 @@ def test_a_page_keeps_the_flights_that_are_not_run_again(tmp_path: Path) -> None
     assert "**Failed**: no overlap" in two and "Run with georef 0.2.0 on a machine, 2026-11-28." in two
 
 
+@pytest.mark.slow
 def test_a_flight_that_fails_is_recorded_with_its_error(tmp_path: Path) -> None:
     (tmp_path / "data/flight/images").mkdir(parents=True)
     run = real_flights.run_flight(_flight("empty"), tmp_path / "data", tmp_path / "out", "smoke")

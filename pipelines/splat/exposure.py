@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
+from numba import njit, prange
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
@@ -191,10 +191,13 @@ class _Exposed(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: AutogradContext, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         saved, gradient = ctx.saved_tensors, grad_outputs[0].contiguous()
-        of_colour, of_affine, of_falloff = (torch.empty_like(saved[index]) for index in (0, 2, 3))
-        outputs = (of_colour, of_affine, of_falloff)
+        colour, _, affine, coefficients = saved
+        of_colour = torch.empty_like(colour)
+        mixing = torch.empty(len(colour), *affine.shape, dtype=torch.float64)
+        falling = torch.empty(len(colour), len(coefficients), dtype=torch.float64)
+        outputs = (of_colour, mixing, falling)
         expose_gradient(*(tensor.detach().numpy() for tensor in (*saved, gradient, *outputs)))
-        return of_colour, None, of_affine, of_falloff
+        return of_colour, None, mixing.sum(dim=0).to(affine), falling.sum(dim=0).to(coefficients)
 
 
 # ruff: noqa: PLR0917  (kernels take arrays, not objects)
@@ -210,7 +213,7 @@ def _light(
     return light + 1.0
 
 
-@kernel(nogil=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def expose(
     colour: ArrayNK3,  # (H, W, 3) float32/64
     radius2: ArrayNK,  # (H, W) float32/64
@@ -218,8 +221,8 @@ def expose(
     coefficients: ArrayN,  # (terms,) float32/64
     shown: ArrayNK3,  # (H, W, 3) float32/64
 ) -> None:
-    """Write `with_affine` of `with_vignetting` of colours into `shown` (H, W, 3)."""
-    for row in range(colour.shape[0]):
+    """Write `with_affine` of `with_vignetting` of colours into `shown` (H, W, 3), rows over threads."""
+    for row in prange(colour.shape[0]):
         for i in range(colour.shape[1]):
             far = float(radius2[row, i])
             light = _light(far, coefficients)
@@ -229,7 +232,7 @@ def expose(
                 shown[row, i, c] = mixed + affine[c, 3]
 
 
-@kernel(nogil=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def expose_gradient(
     colour: ArrayNK3,  # (H, W, 3) float32/64
     radius2: ArrayNK,  # (H, W) float32/64
@@ -237,12 +240,15 @@ def expose_gradient(
     coefficients: ArrayN,  # (terms,) float32/64
     gradient: ArrayNK3,  # (H, W, 3) float32/64
     of_colour: ArrayNK3,  # (H, W, 3) float32/64
-    of_affine: Array34,  # (3, 4) float32/64
-    of_coefficients: ArrayN,  # (terms,) float32/64
+    mixing: ArrayNK3,  # (H, 3, 4) float64
+    falling: ArrayNK,  # (H, terms) float64
 ) -> None:
-    """Write the gradients of colours, affine change and vignetting, given that of what `expose` writes."""
-    mixing, falling = np.zeros((3, 4)), np.zeros(len(coefficients))
-    for row in range(colour.shape[0]):
+    """Write the gradients of colours, and of each row by affine change and vignetting, given that of `shown`.
+
+    Sums over rows are the caller's: their order must not depend on the threads.
+    """
+    for row in prange(colour.shape[0]):
+        mixing[row], falling[row] = 0.0, 0.0
         for i in range(colour.shape[1]):
             far = float(radius2[row, i])
             light = _light(far, coefficients)
@@ -253,16 +259,15 @@ def expose_gradient(
                 level = float(colour[row, i, c])
                 of_colour[row, i, c] = light * back
                 of_light += back * level
-                mixing[0, c] += red * light * level
-                mixing[1, c] += green * light * level
-                mixing[2, c] += blue * light * level
-            mixing[0, 3] += red
-            mixing[1, 3] += green
-            mixing[2, 3] += blue
+                mixing[row, 0, c] += red * light * level
+                mixing[row, 1, c] += green * light * level
+                mixing[row, 2, c] += blue * light * level
+            mixing[row, 0, 3] += red
+            mixing[row, 1, 3] += green
+            mixing[row, 2, 3] += blue
             for k in range(coefficients.shape[0]):
                 of_light *= far
-                falling[k] += of_light
-    of_affine[:], of_coefficients[:] = mixing, falling
+                falling[row, k] += of_light
 
 
 _Values = Any  # a number, an array or a tensor

@@ -292,6 +292,7 @@ def test_what_cannot_be_estimated_is_said_before_sfm(tmp_path: Path, command: Co
     assert "No image has a position" in message and "--gcp" in message
 
 
+@pytest.mark.slow
 def test_offset_of_a_trajectory_by_time(tmp_path: Path, command: Command) -> None:
     """The receiver's log of a simulated flight, 0.2 s ahead of the camera's clock, with true cameras as SfM's."""
     options = {"size": "64x48", "samples": "1", "targets": 0, "images": 24, "flight": "grid"}

@@ -61,6 +61,7 @@ def lengths(posterior: Posterior, survey: Survey) -> tuple[np.ndarray, np.ndarra
     return length_m[0] - length_m[1], np.sqrt(posterior.of_distances(found, rays))
 
 
+@pytest.mark.slow
 def test_distances_set_the_scale_with_the_sigma_that_is_predicted() -> None:
     """Fixes of 2.5 m leave the scale to half a percent, six distances across the block to 0.1 thousandths."""
     normalised, with_bars, without = [], [], []

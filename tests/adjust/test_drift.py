@@ -25,6 +25,7 @@ def _without_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solution, "accuracy_grid", lambda *_: None)
 
 
+@pytest.mark.slow
 def test_heights_that_climb_do_not_tilt_the_survey() -> None:
     result = solved(CLIMB, seed=1)
     # As independent errors, 100 m over 88 m of lines would tilt it by more than 40°.

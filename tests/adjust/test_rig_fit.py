@@ -85,6 +85,7 @@ def test_offset_and_boresight(kind: str, seed: int) -> None:
     assert found.rms_position_m < 0.05
 
 
+@pytest.mark.slow
 def test_lever_arm_with_control_points() -> None:
     data = _data(_flight("orbit"), control=6, arm_m=np.zeros(3))
     found = fit_rig(data, 0.0, np.eye(3), FitOptions(arm=True))
@@ -126,6 +127,7 @@ def _tilted(data: RigData, pixels: float) -> RigData:
     return replace(data, cam_from_local=tilt @ data.cam_from_local, control=moved)
 
 
+@pytest.mark.slow
 def test_sigma_counts_a_lens_that_sfm_has_not_quite_found() -> None:
     data = _tilted(_data(_flight("orbit"), control=6, arm_m=np.zeros(3)), 1.0)
     found = fit_rig(data, 0.0, np.eye(3), FitOptions(arm=True))
@@ -135,6 +137,7 @@ def test_sigma_counts_a_lens_that_sfm_has_not_quite_found() -> None:
     assert np.all(np.abs(found.state.arm - ARM_M) < 3 * found.sigma[11:14])
 
 
+@pytest.mark.slow
 def test_downward_lever_arm_of_a_level_flight_is_not_observable() -> None:
     data = _data(_flight("grid"), arm_m=np.zeros(3))
     found = fit_rig(data, 0.0, np.eye(3), FitOptions(arm=True))

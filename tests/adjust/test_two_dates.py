@@ -75,6 +75,7 @@ def test_apart_the_dates_differ_by_the_errors_of_their_positions() -> None:
     assert np.abs(apart(earlier, later)).max() > 0.5
 
 
+@pytest.mark.slow
 def test_moved_ground_is_left_out() -> None:
     # A quarter of the points, all in the east, have risen by half a metre.
     moved = tuple(np.argsort(-ground()[:COMMON, 0])[: COMMON // 4].tolist())
@@ -85,6 +86,7 @@ def test_moved_ground_is_left_out() -> None:
     np.testing.assert_allclose(found.missed_m[list(moved), 2], 0.5, atol=0.1)
 
 
+@pytest.mark.slow
 def test_a_lens_that_is_wrong_at_one_date_domes_no_difference() -> None:
     """k1 is wrong by 5 % at one date: both take one shape, as points in common are everywhere."""
     squares, errors = [], []
@@ -132,6 +134,7 @@ def test_points_in_a_corner_are_a_caution() -> None:
     assert IN_A_CORNER in {one.code for one in later.posterior.solution.cautions}
 
 
+@pytest.mark.slow
 def test_a_better_own_place_is_told() -> None:
     # RTK at the later date finds the metre by which a consumer receiver had put the earlier one.
     rng = np.random.default_rng(4)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+import pytest
 
 from pipelines.change.along_normals import FILE
 from pipelines.change.options import ChangeOptions
@@ -58,6 +59,7 @@ def write_cloud(workspace: Workspace, rng: np.random.Generator, wall_m: float, *
     save_json(sidecar, sidecar_path(path))
 
 
+@pytest.mark.slow
 def test_a_wall_has_moved_and_the_ground_has_not(tmp_path: Path) -> None:
     before, after = town_pair(tmp_path, changed=False).workspaces
     rng = np.random.default_rng(2)

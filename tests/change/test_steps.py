@@ -135,6 +135,7 @@ def test_the_rim_of_what_is_measured_tells_no_change(tmp_path: Path) -> None:
     assert found[0].net_m3 == pytest.approx(0.6 * heap.sum() * CELL_M**2, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_viewer_draws_regions_on_the_surface(tmp_path: Path) -> None:
     pair = town_pair(tmp_path, changed=True)
     before, after = pair.workspaces
@@ -208,6 +209,7 @@ def test_rasters_older_than_their_survey_are_told(tmp_path: Path, monkeypatch: p
     assert "The rasters of spring are stale" in (out / "change.html").read_text("utf-8")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift_m", [0.03, 0.5])
 def test_a_shifted_base_is_found_or_within_sigma_or_told(tmp_path: Path, shift_m: float) -> None:
     """A wrong base: found on unchanged ground; without registration, within the datum's σ, or told."""

@@ -173,6 +173,7 @@ def test_points_that_stand_still_contradict_a_region(tmp_path: Path) -> None:
     assert judged(40.0, of=Tied((step, step))) == ((0,), ())
 
 
+@pytest.mark.slow
 def test_a_doubtful_region_is_no_change(pair: TownPair, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The largest of four regions is contradicted, the next in a part: names, sums, classes and files follow."""
     before, after = pair.workspaces
@@ -219,6 +220,7 @@ def test_points_of_another_sfm_are_stale(pair: TownPair, tmp_path: Path) -> None
             compared(before, after, tmp_path / name)
 
 
+@pytest.mark.slow
 def test_either_order_is_recognised_and_another_solution_is_not(pair: TownPair, tmp_path: Path) -> None:
     before, after = pair.workspaces
     forwards = load_epoch(after).posterior.solution.earlier

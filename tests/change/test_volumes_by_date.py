@@ -21,7 +21,7 @@ from pipelines.core.workspace import StageRun, Summary, Workspace
 from pipelines.survey.change_report import Change
 from tests.change_pairs import CELL_M, epoch_workspace, tie, town_heights
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 GROWN = {"spring": 0.0, "summer": 0.4, "autumn": 1.0}
 
 

@@ -279,7 +279,8 @@ def test_without_a_workspace_there_is_nothing_to_compare(georef: Georef, tmp_pat
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_busy_workspace_is_not_touched(georef: Georef, survey: Path) -> None:
+def test_busy_workspace_is_not_touched(georef: Georef, survey: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.core.workspace.ORPHAN_S", 0.1)
     with Workspace(survey).lock("train"):
         result = georef("compare", survey)
     result.assert_failed(1, "workspace-busy")

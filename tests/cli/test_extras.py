@@ -110,6 +110,7 @@ def test_option_without_its_extra(
     assert georef("run", finished, "--deliver", "raster").code == 0
 
 
+@pytest.mark.slow
 def test_core_imports_no_extra() -> None:
     """Every file but the viewer's server is imported without the libraries of the extras, and commands answer."""
     hidden = [*(module_of(library) for _, libraries in EXTRAS.values() for library in libraries), "dask", "lz4"]

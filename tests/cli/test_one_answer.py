@@ -248,6 +248,7 @@ def codes(document: dict[str, Any]) -> list[str]:
     return [one["code"] for one in document["cautions"]]
 
 
+@pytest.mark.slow
 def test_a_new_solution_has_not_the_accuracy_of_the_evaluated_one(real_georef: Georef, tmp_path: Path) -> None:
     scene, rng = make_scene(), np.random.default_rng(4)
     noise = Noise(fix_m=(0.3, 0.3, 0.3), bias_m=(1.0, 0.0, 0.0))

@@ -47,6 +47,7 @@ def assert_safe(output: bytes) -> None:
     output.decode("utf-8")
 
 
+@pytest.mark.slow
 def test_texts_of_others_never_steer_the_terminal(tmp_path: Path, photos: Path) -> None:
     workspace = tmp_path / "flight"
     for arguments in (

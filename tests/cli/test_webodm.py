@@ -258,6 +258,7 @@ def test_boundary_that_is_no_area_is_refused(engine: ModuleType, tmp_path: Path,
         engine.boundary_file(text, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_task_from_call_to_files(project: Path, node: socket.socket) -> None:
     gcp = ("--gcp", str(project / "gcp/gcp_list.txt"))
     code, console = run(project, "--dsm", "--3d-tiles", "--cog", "--preset", "smoke", *gcp)

@@ -146,7 +146,8 @@ class TestKilledAtAnyMoment:
 
 
 class TestLock:
-    def test_second_writer_is_told_who_writes(self, workspace: Workspace) -> None:
+    def test_second_writer_is_told_who_writes(self, workspace: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("pipelines.core.workspace.ORPHAN_S", 0.1)
         with (
             workspace.lock("train"),
             pytest.raises(WorkspaceBusyError, match=rf"train in process {os.getpid()}"),

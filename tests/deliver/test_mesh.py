@@ -150,6 +150,7 @@ def test_walls_that_no_view_shows_are_closed(whole: RawMesh, simple: RawMesh) ->
     assert len(simple.faces) < len(whole.faces) / 3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("children_here")
 @pytest.mark.parametrize(("side_m", "spacing_m"), [(40.0, 0.25), (40.0, 0.5)])
 def test_narrow_gaps_are_closed_and_wide_ones_listed(side_m: float, spacing_m: float, tmp_path: Path) -> None:

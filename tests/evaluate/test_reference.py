@@ -185,6 +185,7 @@ def test_dense_noise_shifts_no_distance(tmp_path: Path, height_m: float) -> None
     assert cores.distance_m.mean() == pytest.approx(0, abs=5 * 0.02 / np.sqrt(len(reference)))
 
 
+@pytest.mark.slow
 def test_scores_are_those_of_brute_force(tmp_path: Path) -> None:
     reference, _, kind = (values[::5] for values in town(3, 0.04))
     model, normal, _ = (values[::4] for values in town(4, 0.04))

@@ -40,6 +40,7 @@ def test_names_of_a_table_of_cameras_are_read_back(tmp_path: Path, name: str) ->
     assert read_trajectory(tmp_path / "cameras.csv").names == (name,)
 
 
+@pytest.mark.slow
 def test_one_writer_writes_all_tables() -> None:
     users = {
         file.name

@@ -108,6 +108,7 @@ def _compared(folder: Path, **options: Any) -> tuple[float, int, float, float]:
     return len(found) / len(wanted), len(wanted), float(rms), float(ratio)
 
 
+@pytest.mark.slow
 def test_tags_of_a_small_survey_become_marks(tmp_path: Path) -> None:
     share, count, rms_px, ratio = _compared(
         tmp_path, images=4, size="640x480", samples="4", targets=16, target_size=6.0

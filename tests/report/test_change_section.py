@@ -6,6 +6,8 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from pipelines.change.options import ChangeOptions
 from pipelines.change.stage import run
 from pipelines.core.products import load_json, save_json
@@ -28,6 +30,7 @@ def section(workspace: Workspace, record: RecordFacts) -> str:
     return re.sub(r"[ \n]+", " ", re.sub(r"<[^>]+>", " ", html))
 
 
+@pytest.mark.slow
 def test_the_report_has_the_volumes_of_a_change_that_is_current(tmp_path: Path) -> None:
     before, after = town_pair(tmp_path, changed=True).workspaces
     survey = load_survey(after)

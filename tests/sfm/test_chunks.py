@@ -159,6 +159,7 @@ def test_a_damaged_chunk_is_computed_again(flight: StageRun, photographs: Photog
     assert again.worked == ["features-0000", "matches-0000"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
 def test_a_killed_chunk_goes_on_where_it_was(flight: StageRun, photographs: Photographs) -> None:
     """Photographs whose features were written stay, and the end is the same as without the kill."""

@@ -66,6 +66,7 @@ def error_beyond(model: Any, center: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm((place.apply(solved) - true)[~first], axis=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("beyond", "lens"),
     [((0.0, 1.7, 3.4), WIDE), ((0.0, 1.7), FISHEYE), ((0.0,), WIDE)],

@@ -135,6 +135,7 @@ def test_a_dim_photograph_is_registered_where_it_is_predicted(tmp_path: Path, wa
     assert join.tie.sigma * HEIGHT_M < 0.3
 
 
+@pytest.mark.slow
 def test_rounds_seek_what_positions_predict(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     job, center = flight(tmp_path, Waiting())
     assert rounds.map_in_rounds(pycolmap, job, SILENT).registered == len(center)

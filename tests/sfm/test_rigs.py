@@ -109,6 +109,7 @@ def _is_put_into_its_body(model: Any, survey: Survey, center: FloatArray) -> Non
     assert held.compute_mean_reprojection_error() < 0.3
 
 
+@pytest.mark.slow
 def test_the_lenses_of_an_instant_keep_their_places(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """At 60 m, where a pixel is 11 cm; the rig places the photograph that matches none."""
     job, center = scene(tmp_path)

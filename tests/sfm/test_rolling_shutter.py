@@ -96,6 +96,7 @@ def rms_m(model: object, poses: list[Pose], points: np.ndarray) -> float:
     return float(np.sqrt(np.square(apart).mean()))
 
 
+@pytest.mark.slow
 def test_tie_points_marks_and_photographs_of_a_fast_flight(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-60, 60, 1000), rng.uniform(-30, 66, 1000), rng.uniform(0, 12, 1000)])

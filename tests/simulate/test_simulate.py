@@ -111,6 +111,7 @@ def test_point_files_hold_the_targets(survey: SimulatedSurvey) -> None:
         np.testing.assert_allclose(positions, [places[row[6]] for row in rows], atol=2e-5)
 
 
+@pytest.mark.slow
 def test_targets_are_in_the_photographs(tmp_path: Path) -> None:
     """Boards in the photographs lie at their marks: two white quarters across from each other."""
     survey = SimulatedSurvey(tmp_path / "survey", size="320x240", samples="1", images=3, target_size=4.0, noise=0.0)
@@ -260,6 +261,7 @@ def test_receivers_record_the_same_flight(survey: SimulatedSurvey) -> None:
     assert other.truth.fix_errors != survey.truth.fix_errors
 
 
+@pytest.mark.slow
 def test_neighbours_match_by_sift() -> None:
     """Photographs are rich enough for SfM: neighbours match, and the matches obey the true geometry."""
     world = make_world(SimulateOptions(size="480x360", images=30, targets=0), np.random.SeedSequence(0))

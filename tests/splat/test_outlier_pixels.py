@@ -59,6 +59,7 @@ def ghost(folder: Path, outliers: OutlierPixels | None, *, moving: bool = True) 
     return float((colour.detach() - clean)[SQUARE].abs().mean())
 
 
+@pytest.mark.slow
 def test_a_moving_object_does_not_remain_in_the_splat(tmp_path: Path) -> None:
     """Most of what the object adds to the error disappears; the rest was learned before outliers are looked for."""
     nothing = ghost(tmp_path / "nothing", None, moving=False)

@@ -155,6 +155,7 @@ def test_no_sigma_is_stated_that_nothing_checks(viewed: Workspace, model: Measur
         MeasuringModel(Workspace(tmp_path), model.survey, renderer, CrsOptions())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", ["normal", "whole pixels"])
 def test_sigma_of_a_click_is_that_of_a_persons_pixel(model: MeasuringModel, spread: str) -> None:
     """Thirty distances, clicked a pixel beside the place: their error over the σ of pointing alone."""

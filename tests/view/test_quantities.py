@@ -25,6 +25,7 @@ def exact(places: np.ndarray, cov: np.ndarray | None = None) -> PickedPoints:
     return PickedPoints(places, cov, places[:, 2])
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_sigma_is_that_of_draws(seed: int) -> None:

@@ -42,6 +42,7 @@ def test_single_round_gaussian_has_its_closed_form(camera):
     torch.testing.assert_close(render.colour[..., 0], alpha * (0.5 + 0.4 * basis), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradcheck(make_scene):
     # Central differences of step 1e-6 are good to 1e-9; gradcheck's own tolerances are wider.
     (gaussians, pose), camera = make_scene(3, seed=3, degree=2), Pinhole(11, 8, 9.0, 9.0, 5.5, 4.0)
