@@ -30,6 +30,10 @@ _FEWEST_IMAGES = 3
 _GLOBAL_TRACKS = 200
 # Steps of its adjustment. Without positions a large model straightens slowly: those that follow have them.
 _GLOBAL_STEPS = 25
+# Growth of a model by which the incremental mapper adjusts it as a whole again; between two of these it adjusts what
+# is around each new photograph. At COLMAP's 1.1, 100 photographs take half as long again for the same model
+# (examples/benchmarks/results/scale.md, "Adjustments of the incremental mapper").
+_GROWTH = 1.4
 _REGISTERED = 0.95  # of the photographs: if the global mapper has less, the incremental one has its turn
 
 
@@ -98,6 +102,7 @@ def run_mapper(colmap: ModuleType, mapper: MapperName, run: MapperRun, registere
         options.num_threads, options.random_seed, options.min_model_size = run.threads, run.seed, run.fewest
         options.image_names = list(run.names)
         options.triangulation.ignore_two_view_tracks = run.fewest > 2
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
         if run.lens_held:
             options.ba_refine_focal_length = options.ba_refine_extra_params = False
         models = colmap.incremental_mapping(

@@ -159,7 +159,7 @@ class _Rasterize(torch.autograd.Function):
         saved = [_array(tensor) for tensor in ctx.saved_tensors]
         *parameters, pose, center = saved[:7]
         grads = tuple(_array(grad) for grad in (*grad_outputs[:4], grad_outputs[5]))
-        outputs = [np.zeros_like(parameter) for parameter in parameters]
+        outputs = [np.empty_like(parameter) for parameter in parameters]
         table, normals, lists = context.table, context.normals, context.lists
         hit_gradient = np.empty(len(lists.hits) * cpu_blend.HIT_GRADIENT_WIDTH, dtype=table.dtype)
         of_normals = np.empty(len(lists.hits) * cpu_blend.NORMAL_WIDTH * bool(len(normals)), dtype=table.dtype)

@@ -222,6 +222,8 @@ def colour_gradient(
 ) -> Any:
     """Write row i of ∂L/∂ SH, and return ∂L/∂ direction, with the basis as functions of all space."""
     terms = (degree + 1) ** 2
+    for k in range(terms, g_sh.shape[1]):
+        g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = 0.0, 0.0, 0.0
     gaussian.sh_basis(direction, degree, basis)
     red, green, blue = gaussian.sh_colour(sh, i, basis, terms)
     g_red = sums[D_RED] if red >= 0.0 else 0.0
@@ -312,6 +314,27 @@ def _sum_hits(
                 row[k] += gradient[start + k]
 
 
+@jit
+def _clear(
+    first: int,
+    last: int,
+    g_means: ArrayN3,  # (N, 3) float32/64
+    g_quats: ArrayN4,  # (N, 4) float32/64
+    g_log_scales: ArrayN3,  # (N, 3) float32/64
+    g_logits: ArrayN,  # (N,) float32/64
+    g_sh: ArrayNK3,  # (N, K, 3) float32/64
+) -> None:
+    """Set the gradients of Gaussians first … last − 1, which are not visible, to zero."""
+    for i in range(first, last):
+        for k in range(3):
+            g_means[i, k], g_log_scales[i, k] = 0.0, 0.0
+        for k in range(4):
+            g_quats[i, k] = 0.0
+        g_logits[i] = 0.0
+        for k in range(g_sh.shape[1]):
+            g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = 0.0, 0.0, 0.0
+
+
 @worker_jit
 def _gaussian_gradients(
     means: ArrayN3,  # (N, 3) float32/64
@@ -349,8 +372,11 @@ def _gaussian_gradients(
         _sum_hits(gradient, HIT_GRADIENT_WIDTH, places, splat_start, first, last, block_sums)
         if normal_gradient.shape[0] > 0:
             _sum_hits(normal_gradient, NORMAL_WIDTH, places, splat_start, first, last, block_normals)
+        following, end = block * BLOCK, min((block + 1) * BLOCK, means.shape[0])
         for m in range(first, last):
             i, sums = visible[m], block_sums[m - first]
+            _clear(following, i, g_means, g_quats, g_log_scales, g_logits, g_sh)
+            following = i + 1
             mean = gaussian.row3(means, i)
             direction, scale = gaussian.unit_direction(mean, center)
             (px, py, pz), (g_screen[m, 0], g_screen[m, 1]) = geometry_gradient(
@@ -368,6 +394,7 @@ def _gaussian_gradients(
             share[12] -= dx
             share[13] -= dy
             share[14] -= dz
+        _clear(following, end, g_means, g_quats, g_log_scales, g_logits, g_sh)
         for k in range(CAMERA_WIDTH):
             camera[block, k] = share[k]
 
@@ -406,8 +433,8 @@ def gaussian_gradients(
         gradient, normal_gradient: of the hits by tile, see `blend_gradient`.
         splat_start, places: of the hits of each splat, see `list_hits`.
         block_start: (blocks + 1,) into `visible`: the blocks of BLOCK Gaussians each.
-        g_means, g_quats, g_log_scales, g_logits, g_sh: gradients of the N Gaussians, zero at first; the rows of the
-            visible are written.
+        g_means, g_quats, g_log_scales, g_logits, g_sh: gradients of the N Gaussians, written; those that are not
+            visible have zeros.
         camera: (blocks, CAMERA_WIDTH) each block's share of ∂L/∂ pose and centre, written.
         g_screen: (M, 2) ∂L/∂ screen mean, written.
     """
