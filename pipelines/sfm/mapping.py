@@ -30,8 +30,8 @@ _FEWEST_IMAGES = 3
 _GLOBAL_TRACKS = 200
 # Steps of its adjustment. Without positions a large model straightens slowly: those that follow have them.
 _GLOBAL_STEPS = 25
-# Growth of a model by which the incremental mapper adjusts it as a whole again; between two of these it adjusts what
-# is around each new photograph. At COLMAP's 1.1, 100 photographs take half as long again for the same model
+# Growth of a model by which the incremental mapper adjusts it as a whole again; in between, it adjusts what is
+# around each new photograph. At COLMAP's 1.1, 100 photographs take half as long again for the same model
 # (examples/benchmarks/results/scale.md, "Adjustments of the incremental mapper").
 _GROWTH = 1.4
 _REGISTERED = 0.95  # of the photographs: if the global mapper has less, the incremental one has its turn
