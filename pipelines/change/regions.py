@@ -15,7 +15,6 @@ from itertools import compress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -27,6 +26,7 @@ from pipelines.change.grid import CommonGrid, GridWindow
 from pipelines.core.types import AnyArray, BoolArray, FloatArray, IntArray
 from pipelines.formats.geotiff import cells_inside, outlines, read_cells, write_part
 from pipelines.survey.change_report import ChangedRegion, DoubtfulRegion
+from pipelines.survey.measured_ground import distance_to_others
 
 CELLS = ("difference", "datum", "variance", "step")  # parts that volumes are made of
 _LEAST_REACH, _MOST_REACH = 2, 10  # cells
@@ -143,10 +143,8 @@ def find_regions(
     number = candidates(sign, measured, grid.cell_m2, reach_of(grid, noise), min_area_m2)
     count = int(number.max(initial=0))
     whole, cores, of_given = ([Volume() for _ in range(size)] for size in (count, count, len(given)))
-    # Ground beyond the rasters is not measured. scipy's distances would take four times the memory.
-    around = np.pad(measured, 1).astype(np.uint8)
-    inwards = cv2.distanceTransform(around, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    telling = (sign != 0) & (inwards > _rim_of(grid, noise))
+    # Ground beyond the rasters is not measured.
+    telling = (sign != 0) & (distance_to_others(np.pad(measured, 1))[1:-1, 1:-1] > _rim_of(grid, noise))
     for window in grid.windows():
         cells = parts.cells(window)
         inside = number[window.slices]

@@ -104,19 +104,19 @@ def _closed(cells: BoolArray, radius: float) -> BoolArray:
     radius = min(radius, float(sum(cells.shape)))
     margin = math.ceil(radius) + 1
     padded = np.pad(cells, margin)
-    dilated = _distance(~padded) <= radius
-    closed = _distance(dilated) > radius
+    dilated = distance_to_others(~padded) <= radius
+    closed = distance_to_others(dilated) > radius
     return np.asarray(cells | closed[margin:-margin, margin:-margin])
 
 
 def _without_spikes(cells: BoolArray, radius: float) -> BoolArray:
     """Return cells without tongues that are narrower than twice a radius in cells."""
     padded = np.pad(cells, 1)
-    eroded = _distance(padded) > radius
-    opened = _distance(~eroded) <= radius
+    eroded = distance_to_others(padded) > radius
+    opened = distance_to_others(~eroded) <= radius
     return np.asarray(cells & opened[1:-1, 1:-1])
 
 
-def _distance(cells: BoolArray) -> NDArray[Any]:
+def distance_to_others(cells: BoolArray) -> NDArray[Any]:
     """Return the distance of each chosen cell to the nearest other one, in cells; 0 of the others."""
     return cv2.distanceTransform(cells.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
