@@ -66,7 +66,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rich": ("georef_cli",),
     "pyproj": ("pipelines.geodesy",),
     "pycolmap": ("pipelines.geometry.cameras",),
-    "numba": ("pipelines.splat", "pipelines.surface"),
+    "numba": ("pipelines.sfm.near_matches", "pipelines.splat", "pipelines.surface"),
     "gsplat": ("pipelines.splat.rasterizer.cuda_kernels",),
     "torch": (
         *("pipelines.splat", "pipelines.survey", "pipelines.surface"),

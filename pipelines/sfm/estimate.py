@@ -14,7 +14,7 @@ from pipelines.sfm.options import SfmOptions
 
 _USABLE = 0.9  # of the free memory: other programs grow, too
 # Features a megapixel of aerial photographs, about, of doubled ones and of others, and their number for which the
-# cost of a pair holds: matching compares each feature of a photograph with each of the other.
+# cost of a pair holds: matching compares each feature with those near where it is expected.
 _FEATURES_MEGAPIXEL, _OWN_SIZE_FEATURES_MEGAPIXEL, _PAIR_FEATURES = 6000, 3000, 5000
 _FIXED_BYTES = 300 << 20  # interpreter, libraries, reserves of the allocator
 # Bytes a pixel of the photograph, and of the image that features are detected in, by thread: measured with
@@ -86,7 +86,7 @@ def estimated_cost(photographs: int, photo_px: tuple[int, int], options: SfmOpti
     # Half of the largest number of neighbours: most pairs are chosen by both of their images.
     pairs = every if options.pairs == "exhaustive" else min(every, photographs * options.max_neighbors / 2)
     found = megapixels * (_FEATURES_MEGAPIXEL if doubled else _OWN_SIZE_FEATURES_MEGAPIXEL)
-    compared = pairs * (min(found, options.max_features) / _PAIR_FEATURES) ** 2
+    compared = pairs * min(found, options.max_features) / _PAIR_FEATURES
     work = Work(photographs=photographs, megapixels=photographs * megapixels, pairs=compared)
     steps = ("features" if doubled else "features at own size", "matching", "mapping")
     return ReconstructionCost(*(MEASURED_CORES * COSTS[step].of(work) for step in steps))

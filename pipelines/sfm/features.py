@@ -3,8 +3,9 @@
 Pairs are chosen by positions and viewing directions. COLMAP works in small steps, which survive an interruption.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -15,12 +16,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.machine import chosen_threads
-from pipelines.core.progress import Progress, ProgressTask
+from pipelines.core.progress import Progress
 from pipelines.core.stages import MASKS
 from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.image_file import read_bytes, require_unchanged
 from pipelines.geometry.rotations import matrix_from_quat_xyzw
-from pipelines.sfm.colmap_database import rename_images, write_frame
+from pipelines.sfm.colmap_database import add_matches, rename_images, write_frame
+from pipelines.sfm.guided_matches import GuidedFeatures, guided_matches
+from pipelines.sfm.near_matches import SiftFeatures
 from pipelines.sfm.options import SfmOptions
 from pipelines.survey.survey import Survey, SurveyImage
 
@@ -76,8 +79,8 @@ _IMAGES_PER_STEP = 4
 _PAIRS_PER_STEP = 48
 # Draws of RANSAC for a pair: they find an essential matrix that 32 % of the matches obey, with a probability of
 # 99.9 %. Pairs without a common place would use up COLMAP's 10 000 (examples/benchmarks/results/training.md,
-# "Time to quality").
-_MOST_TRIALS = 2_000
+# "Time to quality"). COLMAP's 100 at least take twice the time, and find the same inliers.
+_FEWEST_TRIALS, _MOST_TRIALS = 30, 2_000
 
 
 @dataclass(frozen=True)
@@ -187,57 +190,67 @@ def extract_features(colmap: ModuleType, job: SfmJob, images: Sequence[int], pro
 
 def match_features(colmap: ModuleType, job: SfmJob, pairs: IntArray, progress: Progress) -> None:
     """Match pairs (P, 2) of photographs whose features are in the database, and verify the matches."""
-    matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
-    matching.num_threads = chosen_threads(job.options.threads)
+    features: dict[int, GuidedFeatures] = {}  # of the last step's photographs
+    with _numbered(colmap, job), progress.task("matching", len(pairs)) as task:
+        for step in steps(pairs, _PAIRS_PER_STEP):
+            with colmap.Database.open(job.database) as opened:
+                unverified = [(a, b) for a, b in step.tolist() if not opened.exists_two_view_geometry(a + 1, b + 1)]
+                unmatched = [(a, b) for a, b in unverified if not opened.exists_matches(a + 1, b + 1)]
+                features = {
+                    index: features.get(index) or GuidedFeatures(SiftFeatures.read(opened, index + 1))
+                    for index in sorted({index for pair in unmatched for index in pair})
+                }
+            add_matches(colmap, job.database, _guided(features, unmatched, chosen_threads(job.options.threads)))
+            colmap.verify_matches(job.database, _listed(job, unverified), verification(colmap, job))
+            task.advance(len(step))
 
-    def match(listing: Path) -> None:
-        pairing.match_list_path = listing
-        colmap.match_image_pairs(job.database, matching, pairing, verification(colmap, job))
 
-    _by_pairs(colmap, job, pairs, match, progress.task("matching", len(pairs)))
+def _guided(
+    features: Mapping[int, GuidedFeatures], pairs: list[tuple[int, int]], threads: int
+) -> dict[tuple[int, int], IntArray]:
+    """Return the guided matches (M, 2) of pairs of photographs."""
+    with ThreadPoolExecutor(threads) as pool:
+        found = pool.map(lambda pair: guided_matches(features[pair[0]], features[pair[1]]), pairs)
+        return dict(zip(pairs, found, strict=True))
 
 
 def verify_matches(colmap: ModuleType, job: SfmJob, pairs: IntArray, progress: Progress) -> None:
     """Verify the matches of pairs (P, 2) that are in the database."""
-
-    def verify(listing: Path) -> None:
-        colmap.verify_matches(job.database, listing, verification(colmap, job))
-
-    _by_pairs(colmap, job, pairs, verify, progress.task("verification", len(pairs)))
+    with _numbered(colmap, job), progress.task("verification", len(pairs)) as task:
+        for step in steps(pairs, _PAIRS_PER_STEP):
+            colmap.verify_matches(job.database, _listed(job, step.tolist()), verification(colmap, job))
+            task.advance(len(step))
 
 
 def verification(colmap: ModuleType, job: SfmJob) -> Any:
     """Return COLMAP's options of the geometric verification of a pair, with the job's seed."""
     options = colmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job.options.seed
-    options.ransac.max_num_trials = _MOST_TRIALS
+    options.ransac.min_num_trials, options.ransac.max_num_trials = _FEWEST_TRIALS, _MOST_TRIALS
     return options
 
 
-def _by_pairs(
-    colmap: ModuleType,
-    job: SfmJob,
-    pairs: IntArray,
-    work: Callable[[Path], None],
-    progress_task: AbstractContextManager[ProgressTask],
-) -> None:
-    """Give lists of a few pairs each to a function of COLMAP, which are files.
-
-    COLMAP reads pairs from a text in which a blank ends a name: numbers replace the names while it works.
-    """
-    listing = job.database.with_name("pairs.txt")
+@contextmanager
+def _numbered(colmap: ModuleType, job: SfmJob) -> Iterator[None]:
+    """Let numbers be the images' names: COLMAP reads pairs from a text in which a blank ends a name."""
     names = [image.name for image in job.survey.images]
     rename_images(colmap, job.database, {name: _number(index) for index, name in enumerate(names)})
     try:
-        with progress_task as task:
-            for step in steps(pairs, _PAIRS_PER_STEP):
-                lines = (f"{_number(a)} {_number(b)}\n" for a, b in step)
-                listing.write_text("".join(lines), encoding="utf-8")
-                work(listing)
-                task.advance(len(step))
+        yield
     finally:
         _restore_names(colmap, job)
-    listing.unlink(missing_ok=True)
+    _listing(job).unlink(missing_ok=True)
+
+
+def _listed(job: SfmJob, pairs: Iterable[Sequence[int]]) -> Path:
+    """Return the file that lists pairs of numbered images for COLMAP."""
+    lines = (f"{_number(a)} {_number(b)}\n" for a, b in pairs)
+    _listing(job).write_text("".join(lines), encoding="utf-8")
+    return _listing(job)
+
+
+def _listing(job: SfmJob) -> Path:
+    return job.database.with_name("pairs.txt")
 
 
 def _restore_names(colmap: ModuleType, job: SfmJob) -> None:

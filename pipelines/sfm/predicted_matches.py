@@ -19,14 +19,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipelines.core.progress import Progress
-from pipelines.core.types import BoolArray, FloatArray, IntArray
+from pipelines.core.types import FloatArray, IntArray
 from pipelines.formats.colmap import lens_of_colmap
-from pipelines.geometry.cameras import Camera, ColmapDatabase, Reconstruction, bearings, project
+from pipelines.geometry.cameras import Camera, Reconstruction, bearings, project
 from pipelines.geometry.rotations import exp_so3, log_so3, matrix_from_quat_xyzw
 from pipelines.geometry.similarity import Similarity
 from pipelines.geometry.statistics import NORMAL_MAD
 from pipelines.sfm.colmap_database import add_matches, copy_database, finish_database, remove_database
 from pipelines.sfm.features import SfmJob, verify_matches
+from pipelines.sfm.near_matches import Expected, SiftFeatures, matches_near
 from pipelines.sfm.parts import placed_by_positions
 from pipelines.survey.survey import Survey
 
@@ -40,11 +41,8 @@ _MOST_NEAR = 40  # photographs of the model, the nearest ones, that are asked fo
 _MOST_PARTNERS = 8  # of a photograph: those with most such points
 _MOST_PAIRS = 400  # each takes up to a second
 _POINTS_AROUND = 5  # of the model, that give a feature its depth
-_MOST_FACTOR = 2.0  # of a feature's size over the predicted one
-_MOST_TURN_RAD = 0.5
 _MOST_DISTANCE = 0.8  # of two descriptors of length one
 _RATIO = 0.9  # of the distance of the best over that of the second; of plain matching 0.8
-_SAME_PLACE_PX = 3.0
 _FEWEST_MATCHES = 15  # COLMAP's fewest inliers of a pair
 _LEAST_SIGMA_PX = 3.0
 
@@ -68,15 +66,6 @@ class _ModelPhotograph:
     view: _View
     xy_px: FloatArray
     point: FloatArray
-
-
-@dataclass(frozen=True)
-class _Features:
-    """N features: pixels (N, 2), size and direction as vectors (N, 2) in px, descriptors (N, D) of length one."""
-
-    xy_px: FloatArray
-    axis_px: FloatArray
-    descriptor: FloatArray
 
 
 @dataclass(frozen=True)
@@ -110,13 +99,14 @@ def add_predicted(colmap: ModuleType, job: SfmJob, model: Reconstruction, progre
     pairs = 0
     with colmap.Database.open(job.database) as opened, progress.task("predicted matches", len(outside)) as task:
         for key, view in outside.items():
-            features = _features(opened, key)
+            features = SiftFeatures.read(opened, key)
             for other in _partners(view, inside, prediction)[: _MOST_PAIRS - pairs]:
-                theirs = _features(opened, other)
-                rows = _matched(features, theirs, _predicted(theirs, inside[other], view, prediction))
+                theirs = SiftFeatures.read(opened, other)
+                expected = _expected(theirs, inside[other], view, prediction)
+                rows = matches_near(theirs, features, expected, ratio=_RATIO, most_distance=_MOST_DISTANCE)
                 if len(rows) >= _FEWEST_MATCHES:
                     pair = (min(key, other) - 1, max(key, other) - 1)
-                    matches[pair] = rows if key < other else rows[:, ::-1]
+                    matches[pair] = rows if other < key else rows[:, ::-1]
                 pairs += 1
             task.advance()
     if matches:
@@ -226,97 +216,26 @@ def _sigma_px(view: _View, away: FloatArray, prediction: _Prediction) -> FloatAr
     return np.asarray(view.camera.mean_focal_px * sigma_rad)
 
 
-def _features(database: ColmapDatabase, key: int) -> _Features:
-    """Return the features of a photograph that have descriptors, which come first."""
-    descriptor = np.asarray(database.read_descriptors(key).data, dtype=np.float64)
-    keypoint = np.asarray(database.read_keypoints(key), dtype=np.float64)[: len(descriptor)]
-    if keypoint.ndim != 2 or keypoint.shape[1] < 4 or not len(keypoint):  # a photograph without features, or shapes
-        return _Features(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 1)))
-    if keypoint.shape[1] == 6:  # an affine shape: its first column is the feature's axis
-        axis = keypoint[:, [2, 4]]
-    else:
-        axis = keypoint[:, 2:3] * np.stack([np.cos(keypoint[:, 3]), np.sin(keypoint[:, 3])], axis=1)
-    length = np.maximum(np.linalg.norm(descriptor, axis=1, keepdims=True), 1e-12)
-    return _Features(keypoint[:, :2], axis, descriptor / length)
-
-
-@dataclass(frozen=True)
-class _Where:
-    """Where the N features of a photograph are predicted in another one: pixels, radii and axes (N, 2); if seen."""
-
-    xy_px: FloatArray
-    radius_px: FloatArray  # (N,)
-    axis_px: FloatArray
-    seen: BoolArray  # (N,)
-
-
-def _predicted(features: _Features, photograph: _ModelPhotograph, other: _View, prediction: _Prediction) -> _Where:
+def _expected(
+    features: SiftFeatures, photograph: _ModelPhotograph, other: _View, prediction: _Prediction
+) -> Expected:
+    """Return where the features of a photograph of the model are expected in another one."""
     view, tree = photograph.view, cKDTree(photograph.xy_px)
     distance = np.linalg.norm(photograph.point - view.center, axis=1)
-    around = distance[tree.query(features.xy_px, k=_POINTS_AROUND)[1]]
+    xy_px = features.xy_px.astype(np.float64)
+    around = distance[tree.query(xy_px, k=_POINTS_AROUND)[1]]
     near, middle, far = np.quantile(around, [0.25, 0.5, 0.75], axis=1)
 
     def places(ray: FloatArray, reach: FloatArray) -> FloatArray:
         return view.center + reach[:, None] * (ray @ view.rotation)
 
-    ray, tip_ray = (bearings(view.camera, px) for px in (features.xy_px, features.xy_px + features.axis_px))
+    ray, tip_ray = (bearings(view.camera, px) for px in (xy_px, xy_px + features.axis_px))
     point = places(ray, middle)
     xy, tip = other.pixels(point), other.pixels(places(tip_ray, middle))
     away = np.linalg.norm(point - other.center, axis=1)
     by_depth = np.linalg.norm(other.pixels(places(ray, far)) - other.pixels(places(ray, near)), axis=1)
     by_pose = _sigma_px(other, away, prediction)
     radius = _SIGMAS * np.hypot(np.hypot(by_pose, by_depth), _LEAST_SIGMA_PX)
-    size = np.array([other.camera.width, other.camera.height])
     known = np.isfinite(xy).all(axis=1) & np.isfinite(tip).all(axis=1) & np.isfinite(radius)
-    with np.errstate(invalid="ignore"):
-        seen = known & (xy > -radius[:, None]).all(axis=1) & (xy < size + radius[:, None]).all(axis=1)
-    return _Where(xy, radius, tip - xy, seen)
-
-
-def _matched(features: _Features, theirs: _Features, where: _Where) -> IntArray:
-    """Return the matches (M, 2) of features with those of another photograph that are predicted among them.
-
-    Each is the best one of the other, and clearly better than the second at another place, among those that the
-    prediction allows.
-    """
-    if not len(features.xy_px) or not where.seen.any():
-        return np.zeros((0, 2), dtype=np.int64)
-    rows = np.flatnonzero(where.seen)
-    tree = cKDTree(features.xy_px)
-    size, turn = np.linalg.norm(features.axis_px, axis=1), _angle(features.axis_px)
-    wanted_size, wanted_turn = np.linalg.norm(where.axis_px, axis=1), _angle(where.axis_px)
-    mine, other, apart = [], [], []
-    for row, near in zip(rows, tree.query_ball_point(where.xy_px[rows], where.radius_px[rows]), strict=True):
-        candidates = np.array(near, dtype=np.int64)
-        ratio = size[candidates] / max(wanted_size[row], 1e-9)
-        turned = np.abs((turn[candidates] - wanted_turn[row] + np.pi) % (2 * np.pi) - np.pi)
-        candidates = candidates[(ratio < _MOST_FACTOR) & (ratio > 1 / _MOST_FACTOR) & (turned < _MOST_TURN_RAD)]
-        cosine = features.descriptor[candidates] @ theirs.descriptor[row]
-        mine.append(candidates)
-        other.append(np.full(len(candidates), row))
-        apart.append(np.sqrt(np.maximum(2 - 2 * cosine, 0)))
-    one, two, distance = np.concatenate(mine), np.concatenate(other), np.concatenate(apart)
-    forth = _unique_best(one, two, distance, theirs.xy_px)
-    back = _unique_best(two, one, distance, features.xy_px)
-    kept = forth & back & (distance < _MOST_DISTANCE)
-    return np.stack([one[kept], two[kept]], axis=1)
-
-
-def _unique_best(key: IntArray, value: IntArray, distance: FloatArray, xy_px: FloatArray) -> BoolArray:
-    """Return which candidates (C,), pairs of key and value, are the best of their key, and unique by the ratio.
-
-    `xy_px` are the places of the values: a second one at the place of the best is the same.
-    """
-    chosen = np.zeros(len(key), dtype=bool)
-    order = np.lexsort((distance, key))
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))
-    for begin, end in zip(first, [*first[1:], len(order)], strict=True):
-        best, rest = order[begin], order[begin + 1 : end]
-        beside = np.linalg.norm(xy_px[value[rest]] - xy_px[value[best]], axis=1) > _SAME_PLACE_PX
-        second = distance[rest[beside]].min(initial=np.inf)
-        chosen[best] = distance[best] < _RATIO * second
-    return chosen
-
-
-def _angle(axis: FloatArray) -> FloatArray:
-    return np.asarray(np.arctan2(axis[:, 1], axis[:, 0]))
+    place, axis = (np.where(known[:, None], each, 0.0).astype(np.float32)[:, None] for each in (xy, tip - xy))
+    return Expected(place, np.where(known, radius, 0.0).astype(np.float32)[:, None], axis)
