@@ -44,6 +44,7 @@ def correct_tie_points(
         for place, (image_id, (rows, xy_px)) in enumerate(seen.items()):
             image = corrected.images[image_id]
             points = np.array([corrected.points3D[image.points2D[row].point3D_id].xyz for row in rows.tolist()])
+            points = points.reshape(-1, 3)  # a photograph may have lost all of them
             depth = points @ flat.rotation_cam_from_local[place, 2] + flat.translation_cam_from_local[place, 2]
             moved = in_global_shutter(flat.camera_of(place), xy_px, depth, travel[place])
             for row, xy in zip(rows.tolist(), np.where(np.isfinite(moved), moved, xy_px), strict=True):

@@ -183,7 +183,11 @@ def _settle(colmap: ModuleType, job: SfmJob, whole: Reconstruction, images: list
         mapper.triangulate_image(options, image_id)
     mapper.complete_and_merge_tracks(options)
     _adjust_part(colmap, job, whole, images)
-    mapper.filter_points(colmap.IncrementalMapperOptions())
+    # Parts beside it that positions have placed fit the lens of this one only when all is adjusted: they stay.
+    limits = colmap.IncrementalMapperOptions()
+    mapper.observation_manager.filter_points3D_in_images(
+        limits.filter_max_reproj_error, limits.filter_min_tri_angle, set(images)
+    )
     mapper.end_reconstruction(False)
     new = set(images)
     tracks = ({element.image_id for element in point.track.elements} for point in whole.points3D.values())

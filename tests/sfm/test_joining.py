@@ -88,3 +88,22 @@ def test_a_strip_of_matches_joins_what_lies_beyond(
     aligned = rounds.map_in_rounds(pycolmap, job, SILENT)
     assert aligned.registered == len(center)
     assert logged_codes(caplog) == ["joined-by-matches"]
+
+
+@pytest.mark.slow
+def test_what_a_joined_photograph_does_not_show_stays_as_it_is(tmp_path: Path) -> None:
+    """A part that positions have placed fits the lens of the others only when all is adjusted."""
+    job, _ = scene(tmp_path, (0.0,))
+    model = map_database(pycolmap, job, SILENT, lens_held=True)[0][0]
+    last = len(BEFORE)  # shows the strip, alone
+    aside = [
+        key for key, each in model.points3D.items() if last not in {part.image_id for part in each.track.elements}
+    ]
+    assert len(aside) > 50
+    for key in aside:
+        model.points3D[key].xyz = model.points3D[key].xyz + 0.05 * model.points3D[key].xyz[2] * np.array([1, 0, 0])
+    model.update_point_3d_errors()
+    assert min(model.points3D[key].error for key in aside) > 4  # what the mapper leaves out
+    whole, joins = join_by_matches(pycolmap, job, model, SILENT)
+    assert [join.images for join in joins] == [(last + 1,)]
+    assert set(aside) <= set(whole.points3D)
