@@ -129,6 +129,13 @@ def test_tie_points_marks_and_photographs_of_a_fast_flight(tmp_path: Path) -> No
     wrong = survey.model_copy(update={"images": tuple(back)})
     kept, none = correct_tie_points(raw, wrong, lambda each: adjust_finally(pycolmap, each, threads=1))
     assert kept is raw and none is None
+    # A photograph that has lost its points, as one beside the others may, is no obstacle.
+    lost, last = type(raw)(raw), len(poses)
+    for row, point in enumerate(lost.images[last].points2D):
+        if point.has_point3D():
+            lost.delete_observation(last, row)
+    model_of_others, _ = correct_tie_points(lost, survey, lambda each: adjust_finally(pycolmap, each, threads=1))
+    assert model_of_others.images[last].num_points3D == 0 < model_of_others.images[last - 1].num_points3D
     # Rows are off by up to 2 px; what is left are the marks' own tenth of a pixel, and the drift of the model.
     assert rms_m(model, poses, points) < 1.2 * rms_m(global_, poses, points) < 0.4 * rms_m(raw, poses, points)
 
