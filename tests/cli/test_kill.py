@@ -48,7 +48,7 @@ main()
 # from where the last was killed.
 MOMENTS: tuple[tuple[str, float | None], ...] = (
     ("sfm.partial/database.db", 0.1),  # features
-    ("sfm.partial/pairs.txt", 0.05),  # matching
+    ("sfm.partial/pairs.txt", 0.0),  # matches are there, and not verified
     ("sfm.partial/mapping", 0.02),  # mapping
     ("train.partial/metrics.jsonl", 0.0),  # iterations
     ("os.rename {ws}/train.partial/checkpoint.tmp", None),
@@ -133,22 +133,23 @@ def _finish(process: subprocess.Popen[str]) -> Result:
 
 
 def _wait_for(process: subprocess.Popen[str], workspace: Workspace, pattern: str) -> None:
-    """Wait until a new file has appeared in the workspace, or one that was there has grown."""
-    before = _sizes(workspace, pattern)
+    """Wait until a new file has appeared in the workspace, one has grown, or a folder was made anew."""
+    before = _changes(workspace, pattern)
     deadline = time.monotonic() + 240
     while process.poll() is None and all(
-        size <= before.get(path, -1) for path, size in _sizes(workspace, pattern).items()
+        changed <= before.get(path, -1) for path, changed in _changes(workspace, pattern).items()
     ):
         assert time.monotonic() < deadline
         time.sleep(0.002)
 
 
-def _sizes(workspace: Workspace, pattern: str) -> dict[Path, int]:
-    sizes = {}
+def _changes(workspace: Workspace, pattern: str) -> dict[Path, int]:
+    changes = {}
     for path in workspace.root.glob(pattern):
         with contextlib.suppress(FileNotFoundError):
-            sizes[path] = path.stat().st_size
-    return sizes
+            stat = path.stat()
+            changes[path] = stat.st_mtime_ns if path.is_dir() else stat.st_size
+    return changes
 
 
 def _assert_completes(workspace: Workspace, whole: Workspace, arguments: tuple[str, ...]) -> None:

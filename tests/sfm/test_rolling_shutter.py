@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pipelines.core.products import save_json
+from pipelines.core.types import FloatArray
 from pipelines.formats.colmap import ROLLING_SHUTTER, flatten, load_reconstruction, read_sparse, write_sparse
 from pipelines.geometry.cameras import Camera
 from pipelines.geometry.rolling_shutter import depths_at, in_global_shutter, in_rolling_shutter
@@ -26,7 +27,7 @@ from pipelines.simulate.lens import BrownLens, Pose
 from pipelines.survey.marks import bearings_at
 from pipelines.survey.photographs import ImageCache, Photograph
 from pipelines.survey.scene import _rolling_shift
-from pipelines.survey.survey import CameraPrior, Fix, SurveyImage
+from pipelines.survey.survey import CameraPrior, Fix, Survey, SurveyImage
 from tests.sfm_scenes import survey_of
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -96,12 +97,12 @@ def rms_m(model: object, poses: list[Pose], points: np.ndarray) -> float:
     return float(np.sqrt(np.square(apart).mean()))
 
 
-@pytest.mark.slow
-def test_tie_points_marks_and_photographs_of_a_fast_flight(tmp_path: Path) -> None:
+def surveyed(folder: Path) -> tuple[list[Pose], FloatArray, Survey]:
+    """Return a fast flight, points on the ground, and its survey; the model that its shutter shows is written."""
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-60, 60, 1000), rng.uniform(-30, 66, 1000), rng.uniform(0, 12, 1000)])
     poses = flight()
-    write_sparse(true_model(poses, points), tmp_path)
+    write_sparse(true_model(poses, points), folder)
     names = [f"{image:02d}.jpg" for image in range(len(poses))]
     survey = survey_of(names)
     camera = survey.cameras[0].model_copy(update={"readout_s": READOUT_S, "width": 640, "height": 480})
@@ -115,8 +116,23 @@ def test_tie_points_marks_and_photographs_of_a_fast_flight(tmp_path: Path) -> No
         )
         for name, pose in zip(names, poses, strict=True)
     ]
-    survey = survey.model_copy(update={"cameras": (camera,), "images": tuple(images)})
+    return poses, points, survey.model_copy(update={"cameras": (camera,), "images": tuple(images)})
 
+
+@pytest.mark.slow
+def test_a_photograph_that_has_lost_its_points_is_no_obstacle(tmp_path: Path) -> None:
+    poses, _, survey = surveyed(tmp_path)
+    model, last = load_reconstruction(tmp_path), len(poses)
+    for row, point in enumerate(model.images[last].points2D):
+        if point.has_point3D():
+            model.delete_observation(last, row)
+    corrected, _ = correct_tie_points(model, survey, lambda each: adjust_finally(pycolmap, each, threads=1))
+    assert corrected.images[last].num_points3D == 0 < corrected.images[last - 1].num_points3D
+
+
+@pytest.mark.slow
+def test_tie_points_marks_and_photographs_of_a_fast_flight(tmp_path: Path) -> None:
+    poses, points, survey = surveyed(tmp_path)
     still = [replace(pose, travel=np.zeros(3)) for pose in poses]
     write_sparse(true_model(still, points), tmp_path / "still")
     raw, global_ = (load_reconstruction(folder) for folder in (tmp_path, tmp_path / "still"))
@@ -125,17 +141,13 @@ def test_tie_points_marks_and_photographs_of_a_fast_flight(tmp_path: Path) -> No
     model, shutter = correct_tie_points(raw, survey, lambda each: adjust_finally(pycolmap, each, threads=1))
     assert shutter is not None
     # Velocities of the other sign make the observations worse, and are refused.
-    back = [each.model_copy(update={"velocity_in_geo": tuple(-np.array(each.velocity_in_geo))}) for each in images]
+    back = [
+        each.model_copy(update={"velocity_in_geo": tuple(-np.array(each.velocity_in_geo))})
+        for each in survey.images
+    ]
     wrong = survey.model_copy(update={"images": tuple(back)})
     kept, none = correct_tie_points(raw, wrong, lambda each: adjust_finally(pycolmap, each, threads=1))
     assert kept is raw and none is None
-    # A photograph that has lost its points, as one beside the others may, is no obstacle.
-    lost, last = type(raw)(raw), len(poses)
-    for row, point in enumerate(lost.images[last].points2D):
-        if point.has_point3D():
-            lost.delete_observation(last, row)
-    model_of_others, _ = correct_tie_points(lost, survey, lambda each: adjust_finally(pycolmap, each, threads=1))
-    assert model_of_others.images[last].num_points3D == 0 < model_of_others.images[last - 1].num_points3D
     # Rows are off by up to 2 px; what is left are the marks' own tenth of a pixel, and the drift of the model.
     assert rms_m(model, poses, points) < 1.2 * rms_m(global_, poses, points) < 0.4 * rms_m(raw, poses, points)
 
@@ -161,8 +173,8 @@ def test_tie_points_marks_and_photographs_of_a_fast_flight(tmp_path: Path) -> No
     stripes = (127 + 120 * np.sin(x / 9.0) * np.sin(y / 11.0)).astype(np.float32)
     full = np.stack([x, y], axis=-1) + 0.5
     moved = in_global_shutter(CAMERA, full.reshape(-1, 2), np.full(x.size, 54.0), travel * 54.0 / depth)
-    moved = moved.reshape(480, 640, 2).astype(np.float32) - 0.5
-    photo = cv2.remap(stripes, moved[..., 0], moved[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    seen = moved.reshape(480, 640, 2).astype(np.float32) - 0.5
+    photo = cv2.remap(stripes, seen[..., 0], seen[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     cv2.imwrite(str(tmp_path / "a.png"), photo)
     cv2.imwrite(str(tmp_path / "b.png"), stripes)
     shots = [Photograph("a", tmp_path / "a.png", CAMERA, "", shift), Photograph("b", tmp_path / "b.png", CAMERA)]
