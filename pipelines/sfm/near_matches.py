@@ -40,7 +40,8 @@ class SiftFeatures:
         """Read a photograph's features that have descriptors, which come first; none of learned or unknown kind."""
         descriptor = np.asarray(database.read_descriptors(key).data)
         keypoint = np.asarray(database.read_keypoints(key), dtype=np.float32)[: len(descriptor)]
-        if keypoint.ndim != 2 or keypoint.shape[1] < 4 or not len(keypoint):
+        known = descriptor.dtype == np.uint8 and descriptor.shape[1:] == (_VALUES,)
+        if not known or keypoint.ndim != 2 or keypoint.shape[1] < 4 or not len(keypoint):
             return cls(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32), np.zeros((0, _VALUES), np.uint8))
         if keypoint.shape[1] == 6:  # an affine shape: its first column is the feature's axis
             axis = keypoint[:, [2, 4]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -115,6 +116,18 @@ def test_photographs_of_other_places_have_no_matches() -> None:
     nothing = first.of(np.arange(0))
     for one, other in ((first, second), (first, nothing), (nothing, nothing)):
         assert guided_matches(GuidedFeatures(one), GuidedFeatures(other)).shape == (0, 2)
+
+
+def test_descriptors_that_are_not_those_of_sift_are_not_read(tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    kind = pycolmap.FeatureExtractorType.SIFT
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        database.write_camera(pycolmap.Camera(camera_id=1, model="PINHOLE", width=9, height=9, params=[9, 9, 4, 4]))
+        for key, values in enumerate((64, 128), start=1):
+            database.write_image(pycolmap.Image(name=f"{key}.jpg", camera_id=1, image_id=key), use_image_id=True)
+            database.write_keypoints(key, np.ones((5, 4), np.float32))
+            database.write_descriptors(key, pycolmap.FeatureDescriptors(kind, np.ones((5, values), np.uint8)))
+        assert [len(SiftFeatures.read(database, key)) for key in (1, 2)] == [0, 5]
 
 
 def slow_matches(
