@@ -146,6 +146,18 @@ def _keep(
         nearest[key, 1] = distance
 
 
+@njit(nogil=True, error_model="numpy")
+def _unique_of(best: NDArray[np.int32], back: NDArray[np.int32], unique: BoolArray) -> NDArray[np.int32]:
+    """Return the matches (M, 2) of those features (N,) that are unique, and the best of their best."""
+    matches = np.empty((len(best), 2), np.int32)
+    found = 0
+    for i in range(len(best)):
+        if unique[i] and back[best[i]] == i:
+            matches[found, 0], matches[found, 1] = i, best[i]
+            found += 1
+    return matches[:found]
+
+
 @kernel(nogil=True, error_model="numpy")
 def _matched(
     xy: Float32Array,  # (N, 2)
@@ -196,15 +208,11 @@ def _matched(
                         apart = square[i] + other_square[j] - 2 * _dot(descriptor, i, other_descriptor, j)
                         _keep(best, nearest, other_xy, i, j, apart)
                         _keep(back, nearest_back, xy, j, i, apart)
-    matches = np.empty((count, 2), np.int32)
-    found = 0
+    unique = np.zeros(count, np.bool_)
     for i in range(count):
-        j = best[i]
-        mutual = j >= 0 and back[j] == i and nearest[i, 0] <= most
-        if mutual and nearest[i, 0] < ratio * min(nearest[i, 1], nearest_back[j, 1]):
-            matches[found, 0], matches[found, 1] = i, j
-            found += 1
-    return matches[:found]
+        if nearest[i, 0] <= most:
+            unique[i] = nearest[i, 0] < ratio * min(nearest[i, 1], nearest_back[best[i], 1])
+    return _unique_of(best, back, unique)
 
 
 @kernel(nogil=True, error_model="numpy")
@@ -233,10 +241,4 @@ def _mutual(
             if apart < nearest_back[j]:
                 nearest_back[j], back[j] = apart, i
         unique[i] = first <= most and first < ratio * second
-    matches = np.empty((count, 2), np.int32)
-    found = 0
-    for i in range(count):
-        if unique[i] and back[best[i]] == i:
-            matches[found, 0], matches[found, 1] = i, best[i]
-            found += 1
-    return matches[:found]
+    return _unique_of(best, back, unique)
